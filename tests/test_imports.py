@@ -23,6 +23,7 @@ ORDER = (
         "page",
         "trust",
         "live",
+        "hands",
         "record",
         "cameras",
         "checks",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from workbench.cameras import commands as cameras
 from workbench.checks import commands as checks
+from workbench.hands import commands as hands
 from workbench.library import commands as library
 from workbench.live import commands as run
 from workbench.live import env_commands as envs
@@ -30,6 +31,7 @@ _MODULES = {
     "Review": (review, share),
     "Library": (library,),
     "The chosen camera": (cameras,),
+    "The selected body": (hands,),
 }
 """Modules of commands by the heading under which the page lists their keys."""
 

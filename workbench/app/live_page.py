@@ -27,6 +27,7 @@ from workbench.cameras.view import shown_cameras
 from workbench.checks.panel import TAB as CHECKS
 from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
+from workbench.hands.panel import HandsPanel
 from workbench.live.commands import ChoosePictures
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
@@ -256,6 +257,7 @@ class Page:
             )
         with tabs.add_tab(INSPECT, viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, self._open_tabs, clock)
+            self._hands = HandsPanel(server, session, lambda: self._inspect.body)
         with tabs.add_tab(TRY, viser.Icon.FLASK):
             self._solve = SolvePanel(server, session, self._open_tabs, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
@@ -263,7 +265,7 @@ class Page:
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
         of_run = self._run, version, options, self._view_panel
-        return [*of_run, self._inspect, self._solve, seeds, profile, checks]
+        return [*of_run, self._inspect, self._hands, self._solve, seeds, profile, checks]
 
     def _add_left_dock(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
@@ -307,6 +309,7 @@ class Page:
         panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
         draw_apart(self._server, panels, lambda: self._draw_scene(view))
         self._watch(view)
+        self._hands.follow_pages()
 
     def _watch(self, view: SessionView) -> None:
         """Request from the session the pictures that the page shows."""
@@ -449,11 +452,12 @@ class Page:
         if collisions := self._view_choice.collisions and len(geometry.collisions) > 0:
             geometry = geometry.as_collisions
         looks = self._in_software.looks(self._view_panel.looks, geometry, self._layout, one)
+        poses = self._hands.moved(geometry, step.poses)
         built = (one, looks, collisions)
         if built != self._built:
             self._built = built
-            self._scene.build(geometry, self._layout, step.poses, env if one else None, looks)
-        self._scene.move(step.poses, self._layout, env if one else None)
+            self._scene.build(geometry, self._layout, poses, env if one else None, looks)
+        self._scene.move(poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
         pictures = self._cameras.shown_pictures(seen) if self._view_choice.frustums else {}
         alone = one or task.num_envs == 1
@@ -463,10 +467,11 @@ class Page:
         placed = self._studio.draw_in_view(view, offset)
         self._frustums.draw(task.cameras, pictures, offset, SMALL_METRES if alone else LARGE_METRES, placed)
         self._forces.draw(self._inspect.forces(view), offset)
-        selected = task.geometry, step.poses, env, self._inspect.body, offset
+        selected = task.geometry, poses, env, self._inspect.body, offset
         self._body_mark.draw(*selected)
         hovered = self._inspect.hovered if self._inspect.hovered != self._inspect.body else ""
-        self._hover_mark.draw(task.geometry, step.poses, env, hovered, offset)
+        self._hover_mark.draw(task.geometry, poses, env, hovered, offset)
+        self._hands.draw_in_view(view, poses, offset)
         if self._view_choice.frames:
             self._frames.draw(*selected)
         else:

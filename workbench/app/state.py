@@ -9,6 +9,7 @@ from workbench.cameras.events import StudioEffect, StudioEvent
 from workbench.cameras.state import Studio
 from workbench.checks import profile as of_profile
 from workbench.checks import state as of_checks
+from workbench.hands import state as of_hands
 from workbench.live import apply as of_run
 from workbench.live import policies as of_policies
 from workbench.live.effects import Then
@@ -34,6 +35,7 @@ SessionEvent = (
     | of_solver.SolverEvent
     | of_policies.PoliciesListed
     | StudioEvent
+    | of_hands.HandEvent
 )
 Effect = (
     RunEffect
@@ -99,10 +101,11 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     solving, for_solver = of_solver.apply(state.solving, event, run)
     policies, for_policies = of_policies.apply(state.policies, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
+    for_hands = of_hands.apply(event, run)
     new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
     # before the checks, so that the checks run first. Effects of the run come after the jobs: when a load is
     # done, the recording must continue before a recorded run is entered.
     for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
-    return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio]
+    return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio, *for_hands]

@@ -494,6 +494,26 @@ def apply_and_fetch(env: BaseEnv) -> None:
     env.scene._gpu_fetch_all()
 
 
+@contextmanager
+def before_each_substep(env: Any, call: Callable[[], None]) -> Iterator[None]:
+    """Context in which `call` runs before each substep, right after the task's ``_before_simulation_step``."""
+    stock = env._before_simulation_step
+    own = vars(env).get("_before_simulation_step")
+
+    def both() -> None:
+        stock()
+        call()
+
+    env._before_simulation_step = both
+    try:
+        yield
+    finally:
+        if own is None:
+            del env._before_simulation_step
+        else:
+            env._before_simulation_step = own
+
+
 def fetch(env: BaseEnv) -> None:
     """Fetch the tensors of the simulation, after ``scene.step()``: ``_gpu_fetch_all``."""
     env.scene._gpu_fetch_all()

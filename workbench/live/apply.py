@@ -430,6 +430,7 @@ def _stepped(run: Run, event: Stepped) -> Run:
         step, serial = moment.step, moment.serial
     first = run.first_step_due
     run = replace(run, recovery=recovery, past=past, step=step, step_serial=serial, first_step_due=False)
+    run = replace(run, pulled=event.pulled)
     if run.problem is not None and run.problem_at_run and not first:
         # The task runs again after a problem at run time: it was reset, or the policy changed.
         run = at_rest(with_problem(run, None))

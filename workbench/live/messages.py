@@ -219,6 +219,32 @@ class EnterRecording:
 
 
 @dataclass(frozen=True)
+class MoveBody:
+    """Put a body at a pose, at rest; followed by a `Stepped` that has `Stepped.restored`. Dropped if the task has no
+    such body."""
+
+    body: str
+    """Name of a dynamic or kinematic body."""
+    env_idx: tuple[int, ...]
+    pose: tuple[float, ...]
+    """(7,) position and quaternion wxyz in the frame of each env."""
+    origin: int
+    """The server's number of the newest moment; returned unchanged."""
+
+
+@dataclass(frozen=True)
+class PullBody:
+    """Pull a body with a spring in every control step until the next `PullBody`; without a body, let go."""
+
+    body: str = ""
+    env: int = 0
+    grabbed: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The spring's end at the body, in the body's frame, in metres."""
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The spring's other end, in the env's frame, in metres."""
+
+
+@dataclass(frozen=True)
 class DrawPast:
     """Draw one env at a past moment without touching its simulation; followed by `PastPictures`."""
 
@@ -278,6 +304,8 @@ Request = (
     | SetCapture
     | Restore
     | EnterRecording
+    | MoveBody
+    | PullBody
     | DrawPast
     | ListenForDebugger
     | Inspect

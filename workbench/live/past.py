@@ -248,6 +248,8 @@ class Past:
         what = "reset" if jump.restored is None else "jump"
         if jump.restored is not None and jump.restored.recording:
             what = "going live"
+        if jump.restored is not None and jump.restored.moved:
+            what = f"move of {jump.restored.moved}"
         if self.history.num_envs == 1:
             return what
         if len(envs) == self.history.num_envs:

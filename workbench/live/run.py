@@ -30,7 +30,7 @@ from workbench.live.messages import (
 )
 from workbench.live.past import Past, Strip
 from workbench.live.process.heartbeat import Busy, own_files_of
-from workbench.task.description import TaskDescription, TaskOptions
+from workbench.task.description import Pulled, TaskDescription, TaskOptions
 from workbench.task.problem import Problem
 from workbench.task.reference import TaskName, followed_folder, named_file
 
@@ -136,6 +136,8 @@ class Run:
     """Why another process restored the version that ran when `problem` occurred; see `TaskFailed.spoiled`."""
     settings: Settings = Settings()
     """Settings chosen on the page."""
+    pulled: Pulled | None = None
+    """The pull by hand during the newest step."""
     told: NDArray[np.float32] | None = None
     """(N, A) next action of the sliders; None if unknown."""
     options_refused: TaskOptions | None = None

@@ -20,7 +20,7 @@ from workbench.live.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import ProcessMemory
 from workbench.live.run import PastLoad, Run, RunState
-from workbench.task.description import TaskDescription, TaskOptions
+from workbench.task.description import Pulled, TaskDescription, TaskOptions
 from workbench.task.problem import Problem
 
 Part = TypeVar("Part")
@@ -73,6 +73,8 @@ class SessionView:
     """Why the present version of the file does not run."""
     settings: Settings = Settings()
     """Settings chosen on the page."""
+    pulled: Pulled | None = None
+    """The pull by hand during the shown step."""
     told: NDArray[np.float32] | None = None
     """(N, A) next action of the sliders; for a past moment, the action that led there. None if unknown."""
     options: TaskOptions = TaskOptions()
@@ -156,4 +158,5 @@ def view_of(run: Run, **known: Any) -> SessionView:
         step_serial=moment.serial,
         pictures=past.pictures(run.env),
         told=moment.step.action,
+        pulled=moment.pulled,
     )

@@ -176,16 +176,28 @@ class Restored:
     replayed: tuple[int, ...] = ()
     """Indices of the envs that were replayed up to the state. A restored state is an exact point: from it,
     the same actions give the same bits. A replayed state is not."""
+    moved: str = ""
+    """Name of the body that a `MoveBody` moved; empty for other requests."""
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """A pull by hand during one control step."""
+
+    env: int
+    body: str
+    newtons: float
+    """Mean norm of the spring's force over the substeps."""
 
 
 @dataclass(frozen=True)
 class Stepped:
-    """One reset, control step or restore of the batch. Each is sent, in order; none is left out."""
+    """One reset, control step, restore or move by hand of the batch. Each is sent, in order; none is left out."""
 
     step: StepResult
     reset_mask: NDArray[np.bool_]
     """(N,) True for each env whose result does not follow from its previous result: it is the first of a new
-    episode, or a past moment that was restored (see `restored`)."""
+    episode, or a state that was restored or made by hand (see `restored`)."""
     captured: tuple[Picture, ...] = ()
     """Pictures of exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
@@ -210,6 +222,8 @@ class Stepped:
     resumed: bool = False
     """Whether the envs continue from the state that the previous worker left. The result then does not follow
     from an earlier result of this worker, although nothing was reset."""
+    pulled: Pulled | None = None
+    """The pull by hand during this control step; the action alone does not lead to this result."""
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,12 @@ def test_the_selected_body_is_shown_first_with_its_pose_and_its_contacts(live_pa
     assert "contacts" in live_page.asked[-1].sections
     live_page.show(view)
     body = inspect.html("wb-body")
-    assert 'data-copy="sapien.Pose(p=[' in body and "touches <span" in body and "&lt;i&gt;table" in body and "5 N" in body
+    assert (
+        'data-copy="sapien.Pose(p=[' in body
+        and "touches <span" in body
+        and "&lt;i&gt;table" in body
+        and "5 N" in body
+    )
     live_page.show(running(2, selected_env=0, inspection=reading))
     assert "5 N" not in inspect.html("wb-body"), "the contacts are of another env"
     live_page.do(SelectBody(body="gone"))

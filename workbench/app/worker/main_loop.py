@@ -25,6 +25,7 @@ from workbench.envs.inspect_env import inspect_env
 from workbench.envs.maniskill_private import mark_camera_configs
 from workbench.envs.step_result import StepResult
 from workbench.envs.task_env import TaskEnv
+from workbench.hands.worker import Hand, move_body
 from workbench.live.messages import (
     SCENE_KEPT,
     Answer,
@@ -38,9 +39,11 @@ from workbench.live.messages import (
     Load,
     Loaded,
     Loading,
+    MoveBody,
     PlaceCamera,
     Play,
     Progress,
+    PullBody,
     Quit,
     ReadPolicyAgain,
     ReloadReport,
@@ -81,7 +84,7 @@ from workbench.rescore.verdict import Rescore, RescoreMoments
 from workbench.solve.questions import PlanActions
 from workbench.solve.worker import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
 from workbench.task.blame import blamed
-from workbench.task.description import Restored, TaskOptions
+from workbench.task.description import Pulled, Restored, TaskOptions
 from workbench.task.modules import executed_modules
 from workbench.task.open import OpenedTask, Opening, warm_up
 from workbench.task.problem import TaskError, treat_ctrl_c_as_error
@@ -112,6 +115,7 @@ class Worker:
         self._checks = WorkerChecks(self._line.waits)
         self._plans = WorkerPlans(self._line.waits)
         self._followed = FollowedPlan(self._line.send)
+        self._hand = Hand()
         self._one_planned_step = False
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
@@ -144,6 +148,8 @@ class Worker:
             SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
             Restore: lambda request: self._task.guarded(partial(self._go, request)),
             EnterRecording: lambda request: self._task.guarded(partial(self._go, request)),
+            MoveBody: lambda request: self._task.guarded(partial(self._move, request)),
+            PullBody: self._hand.take,
             DrawPast: self._cameras.draw_past,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
@@ -487,11 +493,11 @@ class Worker:
         else:
             action = self._chooser.next_action(opened.env)
         before = self._last
-        with blamed("step", opened.loaded, opened.env):
+        with blamed("step", opened.loaded, opened.env), self._hand.pulling(opened.env.env):
             step = opened.env.step(action)
         self._chooser.acted(action)
         self._rate.tick(time.monotonic())
-        self._send_step(step, np.zeros(opened.env.num_envs, bool))
+        self._send_step(step, np.zeros(opened.env.num_envs, bool), pulled=self._hand.pulled)
         ended = np.flatnonzero(step.terminated | step.truncated)
         if self._is_planned:
             done = succeeded(step)
@@ -566,6 +572,14 @@ class Worker:
         self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
+    def _move(self, request: MoveBody, opened: OpenedTask) -> None:
+        self._cameras.settle()  # the envs get new physics scenes
+        with blamed("restore", opened.loaded, opened.env):
+            moved = move_body(opened.env, request)
+        if moved is not None:
+            step, restored = moved
+            self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
+
     def _throttled_status(self, text: Callable[..., str]) -> Callable[..., None]:
         """A progress callback that sends ``text(*arguments)`` as the status, at most once in
         `_STATUS_PERIOD_SECONDS`."""
@@ -578,12 +592,13 @@ class Worker:
         seeds: np.ndarray | None = None,
         restored: Restored | None = None,
         resumed: bool = False,
+        pulled: Pulled | None = None,
     ) -> None:
         assert self._task.opened is not None
         self._last = step
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
-        acted_by = "" if restored else self._chooser.name
+        acted_by = "" if restored else self._chooser.name + (", pulled by hand" if pulled else "")
         event = self._steps.event(
             self._task.opened,
             step,
@@ -594,6 +609,7 @@ class Worker:
             resumed,
             self._cameras.placed,
             self._cameras.failed,
+            pulled,
         )
         self._shares.add("recorded", self._steps.recording_took, time.monotonic())
         self._cameras.scene_changed()
@@ -667,6 +683,7 @@ _DOING: dict[type, Doing] = {
     Reset: "resetting",
     Restore: "resetting",
     EnterRecording: "resetting",
+    MoveBody: "resetting",
     ReadPolicyAgain: "importing the policy",
     WarmUp: "warming up",
     ListTasks: "starting",

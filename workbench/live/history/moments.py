@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,11 @@ from workbench.envs.step_result import TERM_PREFIX, StepResult
 from workbench.live.history.curves import REWARD, Column, Columns, number_of
 from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, EnvTable, Outcome
 from workbench.live.messages import PastPictures, Pictures, ReplayPath
-from workbench.task.description import NO_MOMENT, Restored, Stepped
+from workbench.task.description import NO_MOMENT, Pulled, Restored, Stepped
 
-RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
-"""Event flags of an env at a moment. Success, fail and a NaN or infinite reward are flagged only once per episode."""
+RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE, BY_HAND = 1, 2, 4, 8, 16, 32, 64
+"""Event flags of an env at a moment. Success, fail and a NaN or infinite reward are flagged only once per episode,
+a pull by hand at its first step."""
 _OVERHEAD_BYTES = 2500
 """Memory of the objects around a moment's arrays; with it, the counted total agrees with tracemalloc
 within 2 %."""
@@ -120,6 +122,8 @@ class Moment:
     """The table of envs at that moment."""
     acted_by: str
     """Source of the action, as in `Stepped.acted_by`."""
+    pulled: Pulled | None = None
+    """The pull by hand, as in `Stepped.pulled`."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
     """Pictures by env, kind and name of the camera."""
     outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
@@ -243,6 +247,7 @@ class History:
             size=size,
             rows=rows,
             acted_by=sys.intern(stepped.acted_by),
+            pulled=stepped.pulled,
         )
         self._write(moment)
         self._next_serial += 1
@@ -421,7 +426,7 @@ class History:
         return [
             (moment.serial, moment.restored.origin)
             for moment in self._jumps
-            if moment.restored is not None and moment.restored.origin != NO_MOMENT and moment.jumped[env]
+            if _went_back(moment.restored) and moment.jumped[env]
         ]
 
     def segments(self, env: int) -> list[tuple[int, int]]:
@@ -468,7 +473,8 @@ class History:
         for moment, at in self._moments_back(env, serial):
             jump = moment.restored
             if not moment.jumped.any():
-                if moment.step.action is None or len(rows) == most:
+                by_hand = moment.pulled is not None and moment.pulled.env == at
+                if moment.step.action is None or by_hand or len(rows) == most:
                     return None
                 rows.append(moment.step.action[at])
             elif jump is None or (at not in jump.replayed and jump.origin != NO_MOMENT):
@@ -564,19 +570,31 @@ class History:
             # page's rows below them would move.
             take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
-            take(origin.step, list(restored.env_idx), list(restored.source))
+            # The reward of a state that a hand made is unknown.
+            if not restored.moved:
+                take(origin.step, list(restored.env_idx), list(restored.source))
         return replace(step, reward=reward, evaluate={**step.evaluate, **terms})
 
     def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask
         if jumped.any():
             # Success or fail in a restored state is no event of this moment: it happened at the origin.
-            return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
+            restored = stepped.restored
+            flag = RESET if restored is None else BY_HAND if restored.moved else WENT_BACK
+            return np.where(jumped, flag, 0).astype(np.uint8)
         event_flags = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
         lost = OutlierKind.REWARD_NOT_FINITE
         for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, lost)):
             if what in rows.first:
                 event_flags[rows.first[what] == step.elapsed_steps] |= flag
+        pulled, last = stepped.pulled, self._moments[-1].pulled if self._moments else None
+        if pulled is not None and (last is None or (last.env, last.body) != (pulled.env, pulled.body)):
+            event_flags[pulled.env] |= BY_HAND
         # A task without the entry `fail` may end an episode by a rule of its own.
         event_flags[(rows.outcome == Outcome.FAIL) & (rows.end == step.elapsed_steps)] |= FAIL
         return event_flags
+
+
+def _went_back(restored: Restored | None) -> TypeGuard[Restored]:
+    """Whether it is a jump back to a moment of the history."""
+    return restored is not None and restored.origin != NO_MOMENT and not restored.moved

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from workbench.live.commands import SetSpeed, Step, TogglePlay
 from workbench.live.events import MomentShown
 from workbench.live.history.curves import REWARD, Column, columns_of
-from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.live.history.moments import (
+    BY_HAND,
+    FAIL,
+    RESET,
+    REWARD_NONFINITE,
+    SUCCESS,
+    TRUNCATED,
+    WENT_BACK,
+)
 from workbench.live.panels.moment import MomentPart
 from workbench.live.past import Strip, TimelineView
 from workbench.live.session_protocol import LiveSession
@@ -328,6 +336,7 @@ FLAGS = {
     SUCCESS: "success",
     TRUNCATED: "limit",
     WENT_BACK: "back",
+    BY_HAND: "hand",
     RESET: "reset",
 }
 """Style of each event's mark. Where several events coincide, the first of these is drawn."""
@@ -337,6 +346,7 @@ NAMES = {
     "success": "success",
     "limit": "time limit",
     "back": "went back",
+    "hand": "moved or pulled by hand",
     "reset": "reset",
     "other": "other event",
 }

@@ -16,7 +16,7 @@ from workbench.envs.snapshots.snapshot import Snapshot
 from workbench.envs.state_columns import read_state_columns
 from workbench.envs.step_result import StepResult
 from workbench.pictures.render import recorded_pictures, step_pictures
-from workbench.task.description import Restored, Stepped
+from workbench.task.description import Pulled, Restored, Stepped
 from workbench.task.open import OpenedTask
 
 
@@ -77,6 +77,7 @@ class StepEvents:
         resumed: bool,
         placed: dict[CameraKey, CameraSettings],
         on_failed: Callable[[CannotDraw], None],
+        pulled: Pulled | None = None,
     ) -> Stepped:
         """The next event; see `Stepped` for the arguments.
 
@@ -106,6 +107,7 @@ class StepEvents:
             acted_by,
             placed if columns or captured else {},
             resumed,
+            pulled,
         )
 
     def _pictures(self, opened: OpenedTask, on_failed: Callable[[CannotDraw], None]) -> tuple[Picture, ...]:

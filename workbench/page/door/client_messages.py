@@ -63,6 +63,23 @@ class ScenePointerMessage(ClientMessage):
         _check_numbers(*self.ray_origin, *self.ray_direction, *self.screen_pos[0])
 
 
+class SceneNodeDragMessage(ClientMessage):
+    phase: Literal["start", "update", "end"]
+    name: Name
+    instance_index: int | None
+    start_position: Triple
+    start_screen_pos: Pair
+    end_position: Triple
+    end_screen_pos: Pair
+    button: Literal["left", "middle", "right"]
+    modifier: Modifier | None
+    owner: Name = ""
+
+    def check(self) -> None:
+        _check_numbers(*self.start_position, *self.start_screen_pos)
+        _check_numbers(*self.end_position, *self.end_screen_pos)
+
+
 class TransformControlsDragEndMessage(ClientMessage):
     name: Name
     owner: Name = ""

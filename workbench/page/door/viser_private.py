@@ -65,8 +65,7 @@ REFUSED_FROM_CLIENTS = (
     "ShareUrlDisconnect",
     "FileTransferStartUpload",  # viser limits no size and trusts the file name; we accept no uploads
     "FileTransferPart",
-    "SceneNodeClickMessage",  # our nodes handle no clicks or drags, and our buttons cannot be held
-    "SceneNodeDragMessage",
+    "SceneNodeClickMessage",  # our nodes handle no clicks, and our buttons cannot be held
     "GuiButtonHoldMessage",
 )
 

@@ -1,0 +1,131 @@
+"""What a hand does on the page, and what the session is asked to do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.drive.live import Live, StubSession
+from tests.drive.panels import Panels
+from tests.drive.scenes import running
+from workbench.hands.commands import ChooseMovedEnvs, SetBodyPosition, ToggleHandles
+from workbench.hands.panel import HandsPanel
+from workbench.hands.state import BodyMoved, BodyPulled
+from workbench.live.commands import SelectBody
+from workbench.live.messages import PullBody
+from workbench.page.command import Refused
+
+OFFSET = np.array([5.0, 0.0, 0.0])
+MIDDLE = np.zeros(3)
+PAGE = 3
+
+
+class Hands:
+    """A panel on its own, with `body` selected in env 1 of 3."""
+
+    def __init__(self, panels: Panels, body: str = "cube", playing: bool = False) -> None:
+        self.session = StubSession()
+        self.panel = HandsPanel(panels.server, self.session, lambda: body)  # type: ignore[arg-type]
+        self.view = replace(running(3, selected_env=1), playing=playing)
+        assert self.view.task is not None and self.view.step is not None
+        self.session.shown, self.poses = self.view, self.view.step.poses
+        self.geometry = self.view.task.geometry
+        self.pose = self.poses[1, self.geometry.body_names.index(body)]
+        self.redraw()
+
+    def redraw(self) -> np.ndarray:
+        """Draw; returns the poses as drawn."""
+        moved = self.panel.moved(self.geometry, self.poses)
+        self.panel.draw_in_view(self.view, moved, OFFSET)
+        self.panel.draw(self.view)
+        return moved
+
+    def drag(self, *ends: np.ndarray, grabbed: np.ndarray = MIDDLE) -> None:
+        """Drag from `grabbed` (relative to the body's origin) over points of the env's frame."""
+        start = self.pose[:3] + grabbed + OFFSET
+        phases = ["start", *["update"] * (len(ends) - 1)]
+        for phase, end in zip(phases, ends, strict=True):
+            self.panel.drag(PAGE, phase, start, end + OFFSET)  # type: ignore[arg-type]
+
+
+def test_a_paused_body_follows_the_pointer_and_is_moved_at_the_end(panels: Panels) -> None:
+    hands, grabbed = Hands(panels), np.array([0.01, 0.0, 0.02])
+    hands.drag(hands.pose[:3] + grabbed, np.array([0.3, 0.2, 0.1]), grabbed=grabbed)
+    drawn = hands.redraw()[1, hands.geometry.body_names.index("cube")]
+    np.testing.assert_allclose(drawn[:3], [0.29, 0.2, 0.08], atol=1e-6)
+    assert not hands.session.asked, "only the page shows it until the drag ends"
+    end = np.array([0.4, 0.2, 0.1]) + OFFSET
+    hands.panel.drag(PAGE, "end", end, end)
+    (moved,) = hands.session.asked
+    assert isinstance(moved, BodyMoved) and (moved.body, moved.env_idx) == ("cube", (1,))
+    np.testing.assert_allclose(moved.pose, [0.39, 0.2, 0.08, 1, 0, 0, 0], atol=1e-6)
+    np.testing.assert_array_equal(hands.redraw(), hands.poses)
+
+
+def test_a_playing_body_is_pulled_at_the_grabbed_point_until_the_drag_ends(panels: Panels) -> None:
+    hands, grabbed = Hands(panels, playing=True), np.array([0.0, 0.0, 0.02])
+    hands.drag(hands.pose[:3] + grabbed, np.array([0.0, 0.0, 0.5]), grabbed=grabbed)
+    pull = hands.session.asked[-1].pull
+    assert (pull.body, pull.env) == ("cube", 1)
+    np.testing.assert_allclose(pull.grabbed, grabbed, atol=1e-6)
+    np.testing.assert_allclose(pull.target, [0, 0, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(hands.redraw(), hands.poses)
+    assert panels.nodes("/hands/spring") and [text for text in panels.labels() if text.endswith(" N")]
+    hands.panel.drag(PAGE, "end", OFFSET, OFFSET)
+    assert hands.session.asked[-1] == BodyPulled(PullBody())
+    hands.redraw()
+    assert not panels.nodes("/hands/spring")
+
+
+def test_a_page_that_closes_during_a_pull_lets_go(panels: Panels) -> None:
+    hands = Hands(panels, playing=True)
+    hands.drag(hands.pose[:3])
+    hands.panel.follow_pages()
+    assert hands.session.asked[-1] == BodyPulled(PullBody())
+
+
+def test_another_page_does_not_take_the_body_out_of_the_hand(panels: Panels) -> None:
+    hands = Hands(panels)
+    hands.drag(hands.pose[:3])
+    hands.panel.drag(PAGE + 1, "update", OFFSET, OFFSET + 1)
+    np.testing.assert_array_equal(hands.redraw(), hands.poses)
+
+
+@pytest.mark.parametrize(("body", "playing"), [("arm/hand", False), ("ground", False), ("table", True)])
+def test_a_drag_of_what_does_not_move_is_refused(panels: Panels, body: str, playing: bool) -> None:
+    hands = Hands(panels, body, playing)
+    with pytest.raises(Refused):
+        hands.drag(hands.pose[:3])
+    assert not hands.session.asked
+
+
+def test_a_typed_coordinate_moves_the_selected_body_in_one_env_or_in_all(live_page: Live) -> None:
+    view = running(3, selected_env=2)
+    live_page.show(view)
+    with pytest.raises(Refused):
+        live_page.page.do(SetBodyPosition(of="z", to=0.5), live_page.visitor)
+    assert not live_page.part("Inspect").shows("Position")
+    live_page.do(SelectBody(body="cube"))
+    live_page.show(view)
+    assert live_page.part("Inspect").shows("Position")
+    live_page.do(SetBodyPosition(of="z", to=0.5))
+    moved = live_page.asked[-1]
+    assert isinstance(moved, BodyMoved) and moved.env_idx == (2,) and moved.pose[2] == 0.5
+    live_page.do(ChooseMovedEnvs(all_envs=True))
+    live_page.do(SetBodyPosition(of="x", to=0.1))
+    assert live_page.asked[-1].env_idx == (0, 1, 2)
+
+
+def test_the_handles_are_shown_at_the_body_while_nothing_plays(live_page: Live) -> None:
+    view = replace(running(2), playing=False)
+    live_page.do(SelectBody(body="cube"))
+    live_page.show(view)
+    (gizmo,) = live_page.nodes("/hands/gizmo")
+    assert not gizmo.visible
+    live_page.do(ToggleHandles())
+    live_page.show(view)
+    assert gizmo.visible
+    live_page.show(replace(view, playing=True))
+    assert not gizmo.visible

@@ -1,0 +1,1 @@
+"""Hands in the scene: move and pull the selected body."""

@@ -1,0 +1,40 @@
+"""Commands that move the selected body."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from workbench.page.command import Command
+
+Axis = Literal["x", "y", "z"]
+Angle = Literal["roll", "pitch", "yaw"]
+Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+
+
+class SetBodyPosition(Command, frozen=True):
+    """Move the selected body to this coordinate in the env's frame, in metres."""
+
+    of: Axis
+    to: Number
+
+
+class SetBodyAngle(Command, frozen=True):
+    """Rotate the selected body to this angle about a fixed axis, in degrees."""
+
+    of: Angle
+    to: Number
+
+
+class ToggleHandles(Command, frozen=True):
+    """Show handles that move and rotate the selected body while the envs are paused."""
+
+    key = "m"
+    context = "live"
+
+
+class ChooseMovedEnvs(Command, frozen=True):
+    """Move the body in the selected env, or in all envs."""
+
+    all_envs: bool

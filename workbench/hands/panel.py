@@ -1,0 +1,352 @@
+"""Moves and pulls the selected body: by dragging it in the 3-D view, by handles, and by numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, get_args
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser.transforms import SO3
+
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.hands.commands import (
+    Angle,
+    Axis,
+    ChooseMovedEnvs,
+    SetBodyAngle,
+    SetBodyPosition,
+    ToggleHandles,
+)
+from workbench.hands.state import BodyMoved, BodyPulled, why_not_moved, why_not_pulled
+from workbench.live.messages import PullBody
+from workbench.live.session_protocol import LiveSession
+from workbench.live.view import SessionView
+from workbench.machine.loop import post
+from workbench.page.command import Command, Refused
+from workbench.page.scene.body_pick import box_of_body
+from workbench.page.scene.env_grid import COLOUR, InView, line_set, view_label
+from workbench.page.widgets.fields import Field, choice
+from workbench.page.widgets.keys_and_palette import with_key
+from workbench.page.widgets.notices import refusals_told
+from workbench.page.widgets.parts import PagePart, name_fold
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import Tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+from workbench.pictures.camera_conventions import quaternion_from_rpy, rpy_of
+
+Floats = NDArray[np.floating[Any]]
+Phase = Literal["start", "update", "end"]
+XYZ, ANGLES = get_args(Axis), get_args(Angle)
+TITLE = "Move"
+GIZMO_PIXELS = 76.0
+MIN_GRIP_METRES = 0.01
+"""Minimum side of the box that is dragged, so that a thin body can be hit."""
+PULL_COLOUR = (240, 140, 0)
+HINT = (
+    "Drag the body in the view: while the envs play, a spring pulls it; while they are paused, it moves. "
+    "Shift+U undoes a move."
+)
+
+
+@dataclass(frozen=True)
+class _Selected:
+    """The selected body in the selected env, as it is drawn."""
+
+    body: str
+    kind: str
+    env: int
+    pose: Floats
+    """(7,) in the env's frame."""
+    box: NDArray[np.float32]
+    """(2, 3) lowest and highest corner in the body's frame."""
+    offset: Floats
+    """(3,) position of the env in the view."""
+
+
+@dataclass(frozen=True)
+class _Drag:
+    """A drag of the selected body on one page."""
+
+    client: int
+    how: Literal["move", "pull"]
+    of: _Selected
+    """The body when the drag began."""
+    grabbed: Floats
+    """(3,) the grabbed point in the body's frame."""
+    pose: Floats
+    """(7,) where the body is moved to; for a pull, where it was when the drag began."""
+    target: Floats
+    """(3,) where the grabbed point is pulled to, in the env's frame."""
+
+
+class HandsPanel(PagePart[SessionView]):
+    """The fold *Move* of the Inspect tab, and what a hand drags in the view.
+
+    While a body is moved, only the page shows it at its new pose; the env gets the pose when the drag ends. So a drag is
+    one event of the history.
+
+    Args:
+        body: returns the name of the selected body; empty for none.
+    """
+
+    does = (SetBodyPosition, SetBodyAngle, ToggleHandles, ChooseMovedEnvs)
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession, body: Callable[[], str]) -> None:
+        self._server, self._session, self._body = server, session, body
+        self._handles_on = self._all_envs = False
+        self._selected: _Selected | None = None
+        self._drag: _Drag | None = None
+        self._offset: Floats = np.zeros(3)
+        self._box_of: tuple[int, int, int] | None = None
+        self._box: NDArray[np.float32] | None = None
+        self._fold = server.gui.add_folder(TITLE, visible=False)
+        with self._fold:
+            self._note = server.gui.add_html("", visible=False)
+            self._position = self._row("Position", SetBodyPosition, XYZ, "In the env's frame, metres.", 0.01)
+            self._angles = self._row("Rotation", SetBodyAngle, ANGLES, "Degrees about fixed axes.", 1.0)
+            self._scope = choice(
+                server,
+                "In",
+                ChooseMovedEnvs,
+                "all_envs",
+                {"this env": False, "all envs": True},
+                False,
+                hint="Whether a move applies to the selected env or to all envs.",
+            )
+            self._tools = server.gui.add_html("")
+        self._grip = InView(partial(self._add_grip), "dimensions", "position", "wxyz")
+        self._gizmo = server.scene.add_transform_controls(
+            "/hands/gizmo", GIZMO_PIXELS, fixed=True, depth_test=False, visible=False
+        )
+        self._gizmo.on_update(self._on_gizmo)
+        self._spring = line_set(server, "/hands/spring", PULL_COLOUR, 3.0)
+        self._force = view_label(server, "/hands/force", "bottom-left")
+
+    def _row(self, label: str, kind: type[Command], parts: Sequence[str], hint: str, step: float) -> Field:
+        given = [{"of": part} for part in parts]
+        return Field(self._server, label, kind, "to", [0.0] * 3, given=given, hint=hint, step=step)
+
+    def _add_grip(self, **place: object) -> viser.BoxHandle:
+        box = self._server.scene.add_box("/hands/grip", color=COLOUR, opacity=0.15, **place)  # type: ignore[arg-type]
+        box.on_drag(self._on_drag)
+        return box
+
+    # --- the panel -----------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        task, step = view.task, view.step
+        poses = None if task is None or step is None else self.moved(task.geometry, step.poses)
+        known = self._selected = None if poses is None else self._find(view, poses)
+        self._fold.visible = known is not None
+        if known is None:
+            return
+        why = why_not_moved(known.kind)
+        degrees = [round(angle, 2) for angle in rpy_of(known.pose[3:])]
+        self._position.show([round(float(value), 4) for value in known.pose[:3]], off=bool(why))
+        self._angles.show(degrees, off=bool(why))
+        self._scope.show(self._all_envs, off=bool(why))
+        note = why or HINT
+        if known.kind == "link":
+            note = why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu") or why
+        self._note.content, self._note.visible = render("note", text=note), True
+        handles = Tool(
+            "Handles", ToggleHandles(), with_key(ToggleHandles), on=self._handles_on, off=bool(why)
+        )
+        self._tools.content = tools_html([handles])
+        name_fold(self._fold, TITLE, known.body)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ToggleHandles():
+                self._handles_on = not self._handles_on
+            case ChooseMovedEnvs(all_envs=all_envs):
+                self._all_envs = all_envs
+            case SetBodyPosition(of=axis, to=metres):
+                pose = self._required().pose.copy()
+                pose[XYZ.index(axis)] = metres
+                self._move(pose)
+            case SetBodyAngle(of=angle, to=degrees):
+                pose = self._required().pose.copy()
+                angles = list(rpy_of(pose[3:]))
+                angles[ANGLES.index(angle)] = degrees
+                pose[3:] = quaternion_from_rpy(*angles)
+                self._move(pose)
+
+    def _required(self) -> _Selected:
+        if self._selected is None:
+            raise Refused("Select a body first: click it in the view.")
+        return self._selected
+
+    def _move(self, pose: Floats) -> None:
+        """Put the selected body at a pose in the env's frame. Raises `Refused`."""
+        of = self._required()
+        view = self._session.view()
+        envs = range(view.task.num_envs) if self._all_envs and view.task is not None else (of.env,)
+        self._session.happen(BodyMoved(of.body, tuple(envs), tuple(map(float, pose))))
+
+    def follow_pages(self) -> None:
+        """Let go of what a page drags that was closed."""
+        if self._drag is not None and self._drag.client not in self._server.get_clients():
+            self._let_go()
+
+    # --- the 3-D view --------------------------------------------------------------------------------
+
+    def moved(self, geometry: SceneGeometry, poses: NDArray[np.float32]) -> NDArray[np.float32]:
+        """`poses` (N, B, 7), with the body that is being moved at the pointer."""
+        drag = self._drag
+        if drag is None or drag.how == "pull" or drag.of.body not in geometry.body_names:
+            return poses
+        if poses.shape[:2] != (geometry.num_envs, len(geometry.body_names)):
+            return poses  # the step of another version
+        moved = poses.copy()
+        moved[drag.of.env, geometry.body_names.index(drag.of.body)] = drag.pose
+        return moved
+
+    def draw_in_view(self, view: SessionView, poses: NDArray[np.float32], offset: Floats) -> None:
+        """Draw the grip at the selected body, the handles, and the spring of a pull.
+
+        Args:
+            poses: (N, B, 7), as `moved` returns them.
+            offset: (3,) position of the selected env in the view.
+        """
+        self._offset = np.asarray(offset, np.float64)
+        known = self._selected = self._find(view, poses)
+        can_drag = known is not None and (known.kind in ("dynamic", "link", "kinematic"))
+        if known is None or not can_drag:
+            self._grip.draw()
+        else:
+            size = np.maximum(known.box[1] - known.box[0], MIN_GRIP_METRES) * 1.02
+            middle = SO3(known.pose[3:]).apply(known.box.mean(axis=0)) + known.pose[:3] + offset
+            self._grip.draw(tuple(size.tolist()), tuple(middle.tolist()), tuple(known.pose[3:].tolist()))
+        movable = known is not None and not why_not_moved(known.kind)
+        still = not view.playing and view.timeline.shown is None
+        self._gizmo.visible = self._handles_on and movable and still
+        if known is not None and self._drag is None:
+            self._gizmo.position = tuple((known.pose[:3] + offset).tolist())
+            self._gizmo.wxyz = tuple(known.pose[3:].tolist())
+        self._draw_spring(view, known)
+
+    def _find(self, view: SessionView, poses: NDArray[np.float32]) -> _Selected | None:
+        task, body, env = view.task, self._body(), view.selected_env
+        if task is None or body not in task.geometry.body_names:
+            return None
+        if poses.shape[:2] != (task.num_envs, len(task.geometry.body_names)):
+            return None  # the step of another version
+        row = task.geometry.body_names.index(body)
+        if (of := (id(task.geometry), env, row)) != self._box_of:
+            self._box_of, self._box = of, box_of_body(task.geometry, env, row)
+        box = self._box
+        pose = poses[env, row].astype(np.float64)
+        if box is None or not np.isfinite(pose).all():
+            return None
+        return _Selected(body, task.geometry.body_kinds[row], env, pose, box, self._offset)
+
+    def _draw_spring(self, view: SessionView, known: _Selected | None) -> None:
+        drag, pulled = self._drag, view.pulled
+        if drag is None or drag.how == "move" or known is None or known.body != drag.of.body:
+            self._spring.draw()
+            self._force.draw()
+            return
+        at = SO3(known.pose[3:]).apply(drag.grabbed) + known.pose[:3] + known.offset
+        end = drag.target + known.offset
+        self._spring.draw(np.stack([at, end])[None].astype(np.float32))
+        newtons = pulled.newtons if pulled is not None and pulled.body == drag.of.body else 0.0
+        self._force.draw(f"{newtons:.3g} N", tuple(end.tolist()))
+
+    # --- dragging ------------------------------------------------------------------------------------
+
+    # Async, since viser runs callbacks that are not async in its thread pool, in any order.
+    async def _on_drag(self, event: viser.SceneNodeDragEvent) -> None:
+        start, end = np.array(event.start_position), np.array(event.end_position)
+
+        def handle() -> None:
+            with refusals_told(event.client, then=self._let_go):
+                self.drag(event.client_id, event.phase, start, end)
+
+        post(handle)
+
+    async def _on_gizmo(self, event: viser.TransformControlsEvent) -> None:
+        pose = np.concatenate([event.target.position, event.target.wxyz])
+        post(partial(self._turned, event.client, event.phase, pose))
+
+    def drag(self, client: int, phase: Phase, start: Floats, end: Floats) -> None:
+        """Handle a drag of the selected body with the mouse.
+
+        Args:
+            client: id of the page.
+            start: (3,) the point of the body at which it is held, in the view.
+            end: (3,) the pointer, in the plane through `start` that faces the page's camera.
+
+        Raises:
+            Refused: the body can neither be moved nor pulled now.
+        """
+        if phase == "start":
+            self._begin(client, start)
+        drag = self._drag
+        if drag is None or drag.client != client:
+            return
+        target = end - drag.of.offset
+        if drag.how == "pull":
+            self._pull(drag, target)
+        else:
+            turned = SO3(drag.of.pose[3:]).apply(drag.grabbed)
+            self._drag = _with_pose(drag, np.concatenate([target - turned, drag.of.pose[3:]]))
+        if phase == "end":
+            self._end()
+
+    def _begin(self, client: int, point: Floats) -> None:
+        """Begin a drag at a point of the view. Raises `Refused` if the body can neither be moved nor pulled."""
+        of, view = self._required(), self._session.view()
+        on_gpu = view.task is not None and view.task.backend == "gpu"
+        how: Literal["move", "pull"] = "pull" if view.playing else "move"
+        why = why_not_pulled(of.kind, on_gpu) if how == "pull" else why_not_moved(of.kind)
+        if why:
+            raise Refused(why)
+        grabbed = SO3(of.pose[3:]).inverse().apply(point - of.offset - of.pose[:3])
+        self._drag = _Drag(client, how, of, grabbed, of.pose, point - of.offset)
+
+    def _pull(self, drag: _Drag, target: Floats) -> None:
+        self._drag = _Drag(drag.client, "pull", drag.of, drag.grabbed, drag.pose, target)
+        x, y, z = map(float, drag.grabbed)
+        a, b, c = map(float, target)
+        self._session.happen(BodyPulled(PullBody(drag.of.body, drag.of.env, (x, y, z), (a, b, c))))
+
+    def _turned(self, client: viser.ClientHandle | None, phase: str, pose: Floats) -> None:
+        """Handle a drag of the handles."""
+        if client is None:
+            return
+        with refusals_told(client, then=self._let_go):
+            if phase == "start" or self._drag is None:
+                of = self._required()
+                self._drag = _Drag(client.client_id, "move", of, np.zeros(3), of.pose, of.pose[:3])
+            drag = self._drag
+            if drag.client == client.client_id:
+                pose = pose.copy()
+                pose[:3] -= drag.of.offset
+                self._drag = _with_pose(drag, pose)
+                if phase == "end":
+                    self._end()
+
+    def _end(self) -> None:
+        """End the drag: the env gets the pose, or the spring lets go."""
+        drag, self._drag = self._drag, None
+        if drag is None:
+            return
+        if drag.how == "pull":
+            self._session.happen(BodyPulled(PullBody()))
+        else:
+            self._move(drag.pose)
+
+    def _let_go(self) -> None:
+        """Cancel the drag."""
+        drag, self._drag = self._drag, None
+        if drag is not None and drag.how == "pull":
+            self._session.happen(BodyPulled(PullBody()))
+
+
+def _with_pose(drag: _Drag, pose: Floats) -> _Drag:
+    return _Drag(drag.client, drag.how, drag.of, drag.grabbed, pose, drag.target)

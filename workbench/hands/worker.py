@@ -1,0 +1,154 @@
+"""Moves and pulls bodies in the worker's env."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.physx as physx
+import torch
+from numpy.typing import NDArray
+
+from workbench.envs import maniskill_private
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.simulation.cpu_system import batched_system
+from workbench.envs.snapshots.snapshot import begin_anew
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
+from workbench.live.messages import MoveBody, PullBody
+from workbench.task.description import Pulled, Restored
+
+STIFFNESS = 400.0
+"""Newtons per metre and kilogram: a critically damped spring of 20 rad/s. It holds a body 2.5 cm below the target."""
+MAX_ACCELERATION = 200.0
+"""Bound of the spring's force, in newtons per kilogram, so that a far target does not throw the body through a wall."""
+
+
+def move_body(task: TaskEnv, request: MoveBody) -> tuple[StepResult, Restored] | None:
+    """Put a body at a pose, at rest; None if the env has no such body that can be moved.
+
+    The envs get new physics scenes, so the state is an exact point of the history (`begin_anew`).
+    """
+    env = task.env
+    actor = _actor(env, request.body)
+    if actor is None or actor.px_body_type == "static":
+        return None
+    # Lowest env first, the order of rows in ManiSkill's setters.
+    envs = [i for i in maniskill_private.envs_of(actor).tolist() if i in request.env_idx]
+    if not envs:
+        return None
+    rows = np.zeros((len(envs), 13), np.float32)
+    rows[:, :7] = request.pose
+    rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
+    actor.set_state(torch.as_tensor(rows, device=env.device), torch.as_tensor(envs, device=env.device))
+    maniskill_private.apply_and_fetch(env)
+    if batched_system(env.scene) is not None:
+        begin_anew(env, envs)
+    moved = tuple(envs)
+    how = f"{request.body} was moved by hand."
+    return task.rescore(), Restored(moved, moved, request.origin, None, {}, how=how, moved=request.body)
+
+
+def _actor(env: Any, name: str) -> Any:
+    """The actor of this name, or the merged actor; None if there is none."""
+    found = scene_index(env).states.get(f"actors/{name}")
+    if found is not None:
+        return found
+    return next((actor for actor, _ in scene_index(env).actors if actor.name == name), None)
+
+
+class Hand:
+    """Pulls one body with a spring while the envs step."""
+
+    def __init__(self) -> None:
+        self._request = PullBody()
+        self._spring: _Spring | None = None
+
+    def take(self, request: PullBody) -> None:
+        """Pull as requested from now on; without a body, let go."""
+        self._request = request
+
+    @contextmanager
+    def pulling(self, env: Any) -> Iterator[None]:
+        """Context for one control step: the spring pulls in each of its substeps."""
+        self._spring = _spring(env, self._request)
+        if self._spring is None:
+            yield
+        else:
+            with maniskill_private.before_each_substep(env, self._spring.push):
+                yield
+
+    @property
+    def pulled(self) -> Pulled | None:
+        """The pull during the last control step; None if nothing was pulled."""
+        spring, request = self._spring, self._request
+        if spring is None:
+            return None
+        return Pulled(request.env, request.body, float(np.mean(spring.newtons)) if spring.newtons else 0.0)
+
+
+@dataclass
+class _Spring:
+    px: Any
+    component: Any
+    """SAPIEN's component of the body."""
+    row: int
+    """The body's row in the tensors of the simulation."""
+    mass: float
+    """Kilograms; for a link that of its whole articulation, which the hand has to move."""
+    grabbed: NDArray[np.float64]
+    target: NDArray[np.float64]
+    newtons: list[float] = field(default_factory=list)
+    """Norm of the force in each substep so far."""
+
+    def push(self) -> None:
+        """Apply the spring's force for one substep."""
+        px = self.px
+        px.gpu_fetch_rigid_dynamic_data()
+        px.gpu_fetch_articulation_link_pose()
+        px.gpu_fetch_articulation_link_velocity()
+        state = px.cuda_rigid_body_data.torch()[self.row].double().cpu().numpy()
+        pose = sapien.Pose(state[:3], state[3:7])
+        centre = (pose * self.component.cmass_local_pose).p
+        arm = (pose * sapien.Pose(self.grabbed)).p - centre
+        velocity = state[7:10] + np.cross(state[10:13], arm)
+        pull = STIFFNESS * (self.target - centre - arm) - 2 * np.sqrt(STIFFNESS) * velocity
+        size = float(np.linalg.norm(pull))
+        if not np.isfinite(size):
+            return
+        force = self.mass * pull * min(1.0, MAX_ACCELERATION / max(size, 1e-9))
+        self.newtons.append(float(np.linalg.norm(force)))
+        for tensor, value in (
+            (px.cuda_rigid_body_force, force),
+            (px.cuda_rigid_body_torque, np.cross(arm, force)),
+        ):
+            data = tensor.torch()
+            data[self.row, :3] = torch.as_tensor(value, dtype=data.dtype, device=data.device)
+        px.gpu_apply_rigid_dynamic_force()
+        px.gpu_apply_rigid_dynamic_torque()
+
+
+def _spring(env: Any, request: PullBody) -> _Spring | None:
+    """The spring of a request; None if there is nothing to pull."""
+    if not request.body:
+        return None
+    index = scene_index(env)
+    if request.body not in index.names or request.env >= env.num_envs:
+        return None
+    body = index.names.index(request.body)
+    entity = index.entities[request.env, body]
+    at = np.flatnonzero(np.asarray(index.slots) == request.env * len(index.names) + body)
+    if entity is None or index.kinds[body] not in ("dynamic", "link") or not len(at):
+        return None
+    component = entity.find_component_by_type(physx.PhysxRigidBodyComponent)
+    if index.kinds[body] == "link":
+        mass = sum(link.mass for link in component.articulation.links)
+    else:
+        mass = component.mass
+    row = int(index.rows[int(at[0])])
+    grabbed, target = (np.array(point, np.float64) for point in (request.grabbed, request.target))
+    return _Spring(env.scene.px, component, row, float(mass), grabbed, target)
