@@ -254,7 +254,7 @@ def _dimension_names(controller: Any) -> list[str]:
 
 
 def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:
-    """(A,) True where a number is a joint position, which stays the joint's target until the next action."""
+    """(A,) True for absolute joint positions: each stays the target of its joint until the next action."""
     columns = [np.full(len(part.names), _is_absolute(part.controller)) for part in parts]
     return np.concatenate(columns) if columns else np.zeros(0, bool)
 

@@ -54,7 +54,7 @@ def robots_of(task: type, kwargs: Mapping[str, Any]) -> Any:
     constructor.
 
     None if the constructor has no such parameter, or gives it no default: the constructor may then pass any
-    robot to that of its parent.
+    robot to the constructor of its parent class.
     """
     if "robot_uids" in kwargs:
         return kwargs["robot_uids"]
@@ -81,8 +81,8 @@ def assets_at(path: str | Path) -> list[str]:
 def refuse_downloads(task: str) -> Iterator[None]:
     """Context in which an asset that `task` lacks raises MissingAssets.
 
-    Some tasks declare no assets and fail on a missing file while they build. If ManiSkill notices that, it
-    asks "download now? (y|n)" on standard input, calls ``exit()`` after a no, and treats
+    Some tasks declare no assets and fail on a missing file while they build. If ManiSkill notices the missing
+    file, it asks "download now? (y|n)" on standard input, calls ``exit()`` after a no, and treats
     MS_SKIP_ASSET_DOWNLOAD_PROMPT as a yes. Here nothing is asked or downloaded. An exception becomes the
     cause of a MissingAssets if a download would provide the missing file, or if the file of a robot is
     missing; other exceptions pass.

@@ -121,7 +121,7 @@ def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
     tests (``make test-gpu``) on any machine.
 
     Raises:
-        BackendUnavailable: with the reason, and what to use instead.
+        BackendUnavailable: the backend does not work here; the message says why, and what to use instead.
     """
     if wanted == "gpu" and (reason := why_no_gpu_simulation()) is not None:
         raise BackendUnavailable(f"GPU simulation is not available: {reason}. Use --backend cpu.")
@@ -161,10 +161,10 @@ def _brdf_table() -> sapien.render.RenderTexture:
 def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
     """Give a camera in a scene the BRDF table with which its shader looks up reflections of the environment.
 
-    Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
-    software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
-    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes the
-    table quickly, so this function then does nothing.
+    Without it, SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to
+    19 s on a software driver. With it, the first picture takes 0.1 s and has the same bits. The table is that
+    of the split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes
+    the table quickly, so this function does nothing there.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():

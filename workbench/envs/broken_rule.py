@@ -35,10 +35,10 @@ _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
 traceback anyway."""
 
 Frame = tuple[FrameType, int, int]
-"""A frame, with the instruction and the line at which it was when it was noted."""
+"""A frame, and the index of its instruction and the line number when the frame was stored."""
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
-"""Id of a rule, and the line or subject at which it was broken."""
+"""Id of a rule, and what identifies its breach: a subject, else the line, else the message."""
 
 
 class BrokenRule(CoreRefusal, RuntimeError):

@@ -103,8 +103,8 @@ class MovedCamera:
 
 
 def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
-    """Text such as ``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was
-    moved."""
+    """Text such as ``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if no
+    camera was moved."""
     texts = []
     for one in moved:
         from_step = f" from step {one.state} on" if one.state else ""
@@ -189,12 +189,12 @@ class CameraInfo:
     """Settings in the task's own config, even if the camera was moved later; env 0's if the envs differ. None
     if `CameraSettings` cannot express them (a lens that differs between envs)."""
     varies: bool = False
-    """The camera's pose differs between envs or from its config: the task's code moves the camera."""
+    """Whether the pose differs between envs or from the config, because the task's code moves the camera."""
     site: CallSite | None = None
     """Where the config was made; None if not noted."""
     replaced_shader: str = ""
-    """The shader pack of the camera's config, if another one draws its pictures because this machine cannot
-    trace rays; else empty."""
+    """The shader pack in the camera's config, if this machine cannot trace rays and draws with another pack;
+    else empty."""
 
     @property
     def key(self) -> CameraKey:
@@ -210,7 +210,7 @@ class Picture:
     kind: CameraKind
     env: int
     pose: NDArray[np.float32]
-    """(7,) world pose in the env's frame when the picture was taken: p, then q as wxyz."""
+    """(7,) pose of the camera in the env's frame when the picture was taken: p, then q as wxyz."""
     rgb: NDArray[np.uint8] | None = None
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
@@ -220,8 +220,7 @@ class Picture:
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None
     """(H, W, 3) metres, in the camera's OpenGL frame (x right, y up, z backward); 0 where the ray met
-    nothing. (ManiSkill's observations have whole millimetres.) The minimal shader's numbers end at 32.767
-    m."""
+    nothing. Whole millimetres in ManiSkill's observations; at most 32.767 m with the minimal shader."""
     normal: NDArray[np.float32] | None = None
     """(H, W, 3) of unit length, in the frame of `position`; 0 where the ray met nothing."""
     albedo: NDArray[np.uint8] | None = None

@@ -78,7 +78,7 @@ from workbench.envs.snapshots.task_state import note_constructed, note_scene
 from workbench.envs.strict import StrictMixin
 
 _UNIT_TOLERANCE = 1e-3
-"""A quaternion counts as one of unit length if its length differs from 1 by at most this."""
+"""A quaternion whose length differs from 1 by more than this is not of unit length."""
 SIM_BACKEND = "physx_cpu_batched"
 """Name of this backend. It is not in ManiSkill's ``CPU_SIM_BACKENDS``, for which ManiSkill refuses more than
 one env."""

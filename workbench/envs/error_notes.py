@@ -110,7 +110,7 @@ _running = _Running()
 def chain_of(error: BaseException, suppressed: bool = False) -> Iterator[BaseException]:
     """The error, its cause, the cause of that, and so on.
 
-    A refusal of the core is the last one: its text already explains what caused it.
+    Ends at a refusal of the core, whose text already explains its cause.
 
     Args:
         suppressed: include what ``raise ... from None`` hides.

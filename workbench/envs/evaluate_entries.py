@@ -106,7 +106,7 @@ def _key(key: Any) -> str:
 
 
 def _name(path: str, columns: Mapping[str, Any], others: Mapping[str, Any]) -> str:
-    """`path`, made fit for a file, and unique: the key ``a/b`` and the key ``b`` of a dict ``a`` have the
+    """`path` cleaned, shortened and made unique: the key ``a/b`` and the key ``b`` of a dict ``a`` have the
     same path."""
     name = plain = _clean_name(path)
     number = 2
@@ -197,7 +197,7 @@ def _rows_of(value: Any) -> list[Any] | tuple[Any, ...] | NDArray | None:
 
 
 def type_text(value: Any) -> str:
-    """Type of a value, with the shape of an array."""
+    """Type of a value; for an array or tensor also its dtype and shape."""
     if isinstance(value, torch.Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
@@ -257,8 +257,7 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_flags(evaluate: object) -> str | None:
-    """What is wrong with ``success`` or ``fail``: it is a tensor, but not of bools. None if neither is such a
-    tensor.
+    """What is wrong with ``success`` or ``fail`` if one is a tensor of another dtype than bool; else None.
 
     ManiSkill's step accepts such a tensor, its wrappers do not.
     """

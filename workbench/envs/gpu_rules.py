@@ -15,8 +15,8 @@ from typing import Literal, get_args
 from workbench.machine.parse_python import parse_python
 
 Degree = Literal["stop", "warn", "off"]
-"""*stop* raises at the line that broke the rule. *warn* reports the line, and the task continues: its numbers
-are those that it has without rules, to the last bit. By default a rule stops if its breach makes every later
+"""*stop* raises at the line that broke the rule. *warn* reports the line, and the task continues with
+the same numbers as without rules, to the last bit. By default a rule stops if its breach makes every later
 number wrong, as when the state of other envs is overwritten."""
 DEGREES: tuple[Degree, ...] = get_args(Degree)
 FailOn = Literal["stop", "warn", "never"]
@@ -127,7 +127,7 @@ class Silence:
 
 
 def silences(text: str) -> tuple[Silence, ...]:
-    """The silencing comments in a file's text; none if Python cannot parse it."""
+    """The silencing comments in a file's text; empty if Python cannot parse the text."""
     return _read(text)[0]
 
 

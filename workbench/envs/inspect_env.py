@@ -231,8 +231,7 @@ def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
 
     Contacts are sorted because SAPIEN's order depends on memory addresses, and differs between equal runs.
 
-    After a reset or after restoring a snapshot, the list still shows the last substep before it, until the
-    next step, as in stock ManiSkill.
+    A reset or a restored snapshot does not change the list until the next step, as in stock ManiSkill.
 
     Args:
         env: a ManiSkill env, reset at least once, batched on the CPU or stock; wrappers are removed.

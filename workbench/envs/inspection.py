@@ -30,8 +30,8 @@ class Leaf:
 
 @dataclass(frozen=True)
 class JointReadings:
-    """The J active joints of one articulation; in radians for revolute joints, in metres for prismatic
-    joints."""
+    """The J active joints of one articulation. Positions, targets and limits are in radians for revolute
+    joints, in metres for prismatic joints."""
 
     articulation: str
     names: tuple[str, ...]

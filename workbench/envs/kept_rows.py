@@ -1,4 +1,4 @@
-"""Finds rows of other envs that a partial reset changed in a task's attributes, and the line at fault."""
+"""Finds rows of a task's attributes that a partial reset changed for other envs, and the line at fault."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from workbench.envs.snapshots.task_state import is_per_env, version_of
 from workbench.machine.library_files import is_installed
 
 MAX_TRACED_LINES = 2000
-"""In one reset, values are compared after each of the author's lines, up to this number of lines."""
+"""Maximum number of the author's lines after which values are compared in one reset."""
 _ROUNDING_TOLERANCE = 1e-5
 """Tolerance for values computed again from the same poses; rotations were seen to differ by 1e-7."""
 _ITEM = re.compile(r"\[(\d+)\]")
@@ -55,9 +55,10 @@ class KeptRows:
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
     def changed_envs(self) -> dict[str, tuple[int, ...]]:
-        """The other envs whose rows changed, by path (without ``self.``); only paths with a change.
+        """The envs that are not being reset and whose rows changed, by path (without ``self.``).
 
-        The tuple is empty if the value now has rows for the envs being reset only.
+        Only paths with a change are included. The tuple is empty if the value now has rows for the envs being
+        reset only.
         """
         now = self._read(walk_task_values(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
@@ -90,7 +91,7 @@ class KeptRows:
         return read
 
     def _difference(self, before: Any, now: Any) -> tuple[int, ...] | None:
-        """Envs as in `changed_envs`; None if no row of another env changed."""
+        """The tuple of `changed_envs` for one value; None if the value counts as unchanged."""
         elsewhere = self._elsewhere
         if isinstance(before, list) and isinstance(now, list):
             if len(now) == len(before):
@@ -115,7 +116,8 @@ def _is_outside_the_agent(path: str) -> bool:
 
 
 def _paths(walk: Walk, num_envs: int) -> tuple[list[str], dict[str, list[str]]]:
-    """Paths of values with a row for each env; and groups of N paths, one for each env (a list of N tensors)."""
+    """Paths of values with a row for each env; and groups of N paths, one for each env, as for a list of N
+    tensors."""
     single, items = [], {}
     for leaf in walk.leaves:
         if not _is_outside_the_agent(leaf.path):
@@ -250,7 +252,7 @@ class ResetWatch:
         self._chosen: tuple[int, ...] = ()
         self._task: type | None = None
         self._tries = 0
-        """Number of resets in which lines may still be traced, of `_MAX_TRACED_RESETS`."""
+        """Number of further resets in which lines may be traced; at first `_MAX_TRACED_RESETS`."""
         self._seeks = False
         """Whether to trace lines in the next reset."""
         self.whole = False

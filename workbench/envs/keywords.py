@@ -41,8 +41,8 @@ class Keyword:
     value: str
     """Value in effect, in JSON; the ``repr`` of a value that JSON cannot hold."""
     default: str = ""
-    """Value that holds without the user's argument, in JSON: that of the registration, else that of the class
-    (``null`` if the class has none). Empty for `MODES`, and if JSON cannot hold the value."""
+    """Value without the user's argument, in JSON: from the registration, else the default of the class
+    (``null`` if there is none). Empty for `MODES`, and if JSON cannot hold the value."""
     choices: tuple[str, ...] = ()
     """Allowed values of kind ``choice``, in JSON."""
     optional: bool = False
@@ -66,7 +66,7 @@ class HowMade:
 def describe_keywords(
     cls: type, env: Any, given: Mapping[str, Any], registered: Mapping[str, Any], stop: type
 ) -> HowMade:
-    """How `env` was made, and what else it could be made with.
+    """The keywords with which `env` was made, and the values that they can have.
 
     Args:
         cls: the author's class.
@@ -137,8 +137,8 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
 
 
 def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
-    """Named parameters of the class's ``__init__``, then of those of its bases, up to the first without
-    ``**kwargs``.
+    """Named parameters of the ``__init__`` of the class, then of each base class. Ends after the first
+    ``__init__`` without ``**kwargs``.
 
     Args:
         stop: the base class at which to stop: its parameters and those of its bases are left out.
@@ -193,7 +193,7 @@ def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: A
 
 
 def _plain(value: Any) -> Any:
-    """The value of a member of an Enum, as a command line gives it; any other value unchanged."""
+    """The value of an Enum member, which is what a command line takes; any other value unchanged."""
     return value.value if isinstance(value, enum.Enum) else value
 
 

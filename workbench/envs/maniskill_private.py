@@ -91,8 +91,8 @@ PRIVATE_NAMES = (
     *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
     *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
 )
-"""Private names that the workbench uses. If a name is missing, its feature is off; if the name has no
-feature (""), no task can be opened."""
+"""Private names that the workbench uses. If a name is missing, its feature is off. If a name without a
+feature ("") is missing, no task can be opened."""
 
 
 @cache
@@ -125,7 +125,7 @@ def _with_advice(moved: Iterable[PrivateName]) -> str:
 def draw_at(drawn: Any, pose: NDArray[np.float32]) -> None:
     """Draw a ``RenderBodyComponent`` at a pose (7,) until the next ``update_render``; its entity stays where it is.
 
-    Without SAPIEN's private node it is drawn where its entity is.
+    If the component lacks SAPIEN's private node, it is drawn where its entity is.
     """
     if (node := getattr(drawn, "_internal_node", None)) is not None:
         node.set_position(pose[:3])
@@ -311,7 +311,8 @@ def install_base_env_hooks() -> None:
     """
     stock_init, stock_setup = BaseEnv.__init__, BaseEnv._setup_scene
 
-    # Named like the stock one: the name of this frame keeps an error from being attributed to a call of super().__init__().
+    # Keep the name `__init__`: without it, an error in the build would be attributed to the author's call of
+    # super().__init__().
     @wraps(stock_init)
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
         defaults, fixed = self.__dict__.pop(_BASE_ARGUMENTS, ({}, {}))
@@ -424,8 +425,8 @@ def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
     """Context in which ``_episode_rng``, from which the robot's initial joints are drawn, is the generator of env `index`.
 
     In ManiSkill ``_episode_rng`` is always the generator of env 0: a partial reset of env 3 would draw from
-    that one and ignore the seed of env 3. Also stops ``enhanced_determinism`` from drawing new seeds, as it
-    does in a reset without a seed.
+    that one and ignore the seed of env 3. Also turns ``enhanced_determinism`` off, which would draw new seeds
+    because ManiSkill's reset gets none.
     """
     env._episode_rng = env._batched_episode_rng[index]
     draws_seeds, env._enhanced_determinism = env._enhanced_determinism, False
@@ -603,7 +604,7 @@ def extra_observation(env: BaseEnv, info: dict[str, Any]) -> Any:
 
 
 def cameras(env: Any) -> dict[CameraKey, Any]:
-    """``_sensors``, tactile ones too, then ``_human_render_cameras``; an env without a render device has neither."""
+    """``_sensors`` (also tactile sensors), then ``_human_render_cameras``; empty without a render device."""
     lists: tuple[tuple[CameraKind, str], ...] = (("sensor", "_sensors"), ("human", "_human_render_cameras"))
     return {(kind, name): c for kind, held in lists for name, c in getattr(env, held, {}).items()}
 

@@ -22,9 +22,9 @@ MAX_DROP_METRES = 0.5
 """Maximum drop in metres since the start of the episode, of a body that is not part of an articulation: more than the height
 of a block, less than that of a table."""
 REWARD_RANGES: dict[str, tuple[float, float]] = {"sparse": (-1.0, 1.0), "normalized_dense": (-1.0, 1.0)}
-"""Range of the rewards of each mode for which ManiSkill defines one. A sparse reward is success minus fail. A
-normalized reward is the dense reward divided by its maximum; it is negative where a task subtracts penalties.
-A plain dense reward has no range."""
+"""Range of rewards by mode, for the modes whose range ManiSkill defines. A sparse reward is success minus
+fail. A normalized reward is the dense reward divided by its maximum; it is negative where a task subtracts
+penalties. A plain dense reward has no range."""
 ROUNDING = 1e-4
 """Tolerance of the range: 3.0000002 / 3 is not out of range."""
 
@@ -226,9 +226,10 @@ class OutlierSighting:
     envs: NDArray[np.bool_]
     """(N,)"""
     reason: Callable[[int], str]
-    """The text for one of these envs. Called only for the first outlier of a kind: texts cost more than the checks."""
+    """Returns the text for one of these envs. Called only for the first outlier of a kind: texts cost more
+    than the checks."""
     body: Callable[[int], str] | None = None
-    """Name of the body that is the outlier, in one of these envs; None for outliers that are not bodies."""
+    """Returns the name of the outlier body in one of these envs; None if this kind is not about bodies."""
 
 
 class OutlierWatch:
@@ -352,7 +353,7 @@ def _nan_text(values: NDArray) -> str:
 
 
 def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> float:
-    """Height in metres of the lowest vertex of any static body; -inf without one."""
+    """Height in metres of the lowest vertex of any static body; -inf if there is no static body."""
     lowest = [np.inf]
     static = np.array([kind == "static" for kind in geometry.body_kinds], bool)
     for visual in geometry.visuals:

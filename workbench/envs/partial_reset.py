@@ -63,14 +63,14 @@ def without_target_flags(env: Any) -> list[BaseController]:
 
 
 def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
-    """The envs that a reset with these options does not touch; empty for a reset of all."""
+    """The envs that a reset with these options does not touch; empty for a reset of all envs."""
     chosen = _chosen(env, options or {})
     return [] if chosen is None else sorted(set(range(env.num_envs)).difference(chosen))
 
 
 def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
     """The envs to reset that `options` names; None for all. As in ManiSkill, -1 is the last env, and a mask
-    with a row for each env names those where it is True."""
+    (N,) names the envs where it is True."""
     named = options.get("env_idx")
     if named is None:
         return None
@@ -125,7 +125,7 @@ def _rows(value: Any, order: list[int]) -> Any:
 def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
     """Context in which a reset of these envs, in ascending order, starts their episodes from these seeds.
 
-    ``BaseEnv.reset(seed=[...])`` takes the list as the seeds of the whole batch.
+    ``BaseEnv.reset(seed=[...])`` cannot do this: it takes the list as the seeds of the whole batch.
     """
     set_episode_seeds(env, env_idx, seeds)
     devices = [env.device] if env.device.type == "cuda" else []

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """T actions of one env, and the T + 1 states of its episode as far as they were recorded.
+    """T actions of one env, and the T + 1 states of its episode if they were recorded.
 
     State 0 is the reset; action t leads to state t + 1.
     """
@@ -62,7 +62,7 @@ class RecordedRun:
 def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distances between the poses `a` and `b`: (...) in metres and (...) in radians.
 
-    Both are 0 where both poses are NaN, and infinite where only one pose is NaN.
+    Both distances are 0 where both poses are NaN, and infinite where only one pose is NaN.
 
     Args:
         a, b: (..., 7) position in metres and quaternion wxyz.
@@ -71,8 +71,8 @@ def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray
     lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
     with np.errstate(invalid="ignore"):
         metres = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
-        # From the chord between the quaternions: in single precision, the arc cosine of their product cannot tell angles
-        # below 3e-4 from zero. q and -q are the same rotation.
+        # Use the chord between the quaternions: in single precision, the arc cosine of their dot product
+        # cannot tell angles below 3e-4 from zero. q and -q are the same rotation.
         p, q = a[..., 3:], b[..., 3:]
         chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
         radians = 4 * np.arcsin(np.clip(chord / 2, 0, 1))
@@ -89,7 +89,7 @@ STATE, OBS = "state/", "obs/"
 
 
 def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
-    """States of one env, by actor or articulation; without those that the env lacks (their rows are NaN)."""
+    """States of one env, by actor or articulation; leaves out bodies that the env lacks (rows of NaN)."""
     rows = {name[len(STATE) :]: column[env] for name, column in columns.items() if name.startswith(STATE)}
     return {name: row for name, row in rows.items() if not np.isnan(row).all()}
 
@@ -104,8 +104,8 @@ RUN_KEYWORDS = frozenset({"num_envs", "sim_backend", "render_backend", "render_d
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of ``gym.make`` that make `env` again: `given` and the env's modes.
 
-    Leaves out values that JSON cannot hold, and `RUN_KEYWORDS`: ManiSkill's ``replay_trajectory``, which
-    calls ``gym.make(env_id, **env_kwargs)``, chooses these itself.
+    Leaves out values that JSON cannot hold, and `RUN_KEYWORDS`, which ManiSkill's ``replay_trajectory``
+    chooses itself when it calls ``gym.make(env_id, **env_kwargs)``.
     """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if (mode := control_mode_of(env)) is not None:

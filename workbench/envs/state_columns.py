@@ -30,8 +30,8 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     ``state/actors/cube`` (N, 13) and ``state/articulations/panda`` (N, 13 + 2 * joints) as ``get_state_dict``
     lays them out, ``obs/agent/qpos`` (N, ...) by the task's names. Unlike in ManiSkill, the row of a body
     that an env lacks is NaN (ManiSkill's tensor has fewer rows, and ``RecordEpisode`` then records no state).
-    A flattened observation is split by its names, or is one column ``obs/`` if they are not known. Pictures
-    are left out: a recording stores them separately.
+    A flattened observation is split into its named parts; if their names are not known, it is one column
+    ``obs/``. Pictures are left out: a recording stores them separately.
 
     Raises:
         Exception: raised by the task's own ``get_state_dict``.
@@ -80,9 +80,9 @@ def copy_states(task: TaskEnv) -> StateReading:
 def env_states(env: BaseEnv) -> dict[str, Any]:
     """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
 
-    Copies: tensors, or arrays on the CPU. Equal to ManiSkill's ``get_state_dict`` to the last bit (tested),
-    which reads each actor and articulation in turn (75 us for the four in PickCube). If the task has its own
-    ``get_state_dict``, that is called."""
+    Copies: tensors, or arrays on the CPU. ManiSkill's ``get_state_dict`` gives the same values to the last
+    bit (tested), but reads each actor and articulation in turn (75 us for the four in PickCube). A task's own
+    ``get_state_dict`` is called instead."""
     rows, asked = _read(env)
     return asked if rows is None else {**rows.states(), **asked}
 

@@ -48,8 +48,8 @@ class StrictMixin:
 
     * state set but not applied; state applied or read without a fetch after a step; links read before their
       articulation's new qpos reached them (`strict_system`);
-    * what the GPU refuses: state touched while the scene is built, static actors moved, masses set once it
-      is built (`accessors`);
+    * what the GPU refuses: state read or set during the build of the scene, static actors moved, masses set
+      after the build (`accessors`);
     * SAPIEN's own setters, which the GPU ignores (`accessors`);
     * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or
       changed (this module and `kept_rows`);
@@ -65,7 +65,7 @@ class StrictMixin:
     _workbench_task: type[BaseEnv]
     _system_class = StrictCpuSystem
     _rule_choice: Degree | None = None
-    """The degree of all rules; None for each rule's own."""
+    """The degree of all rules; None if each rule has its own degree."""
     _on_finding: Callable[[Finding], None] = staticmethod(warn_of)
     _wrong_obs: tuple[str, str] | None = None
     """Hook and problem of the observation that is being assembled."""

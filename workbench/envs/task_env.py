@@ -83,7 +83,7 @@ class EnvOptions:
 def given_arguments(
     task: type[BaseEnv], env_kwargs: Mapping[str, Any], default_kwargs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Keyword arguments for the constructor of the task class, without those that are fields of `EnvOptions`.
+    """Keyword arguments for the constructor of the task class, from the registration and the user.
 
     Args:
         env_kwargs: the user's arguments, in JSON.

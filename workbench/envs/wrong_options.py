@@ -37,8 +37,8 @@ class WrongOption(CoreRefusal, ValueError):
 
 
 def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseException) -> WrongOption | None:
-    """The argument in `given` that does not exist or has an unknown value; None if `error` is not ManiSkill's own, or
-    each argument is known.
+    """Error for the argument in `given` that does not exist or has an unknown value; None if `error` is not
+    ManiSkill's own, or every argument is known.
 
     Args:
         given: the user's arguments, without those of the registration.
@@ -70,7 +70,7 @@ def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseExcep
 
 
 def _taken_by_name(task: type[BaseEnv]) -> set[str]:
-    """Strings in the constructors, since ``kwargs.pop("size")`` takes a keyword too."""
+    """All strings in the code of the constructors: ``kwargs.pop("size")`` takes a keyword too."""
     codes = [getattr(vars(owner).get("__init__"), "__code__", None) for owner in task.__mro__]
     return {text for code in codes if code is not None for text in code.co_consts if isinstance(text, str)}
 

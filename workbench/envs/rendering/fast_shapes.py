@@ -41,8 +41,8 @@ _MIN_DISTANCE_METRES = 0.02
 """Smallest distance that tolerances assume: no camera stays nearer for long, and a camera inside its own mount would
 forbid any simplification."""
 _TOLERANCE_UNIT_METRES = 1e-4
-"""A larger tolerance is rounded down to this times a power of the fourth root of two, so that similar poses
-give the same meshes."""
+"""Tolerances above this value are rounded down to the value times a power of the fourth root of two, so that
+similar poses give the same meshes."""
 
 _MIN_LEAN_PIXELS = 256 * 256
 """In a picture with fewer pixels, leaving out textures saves less time than checking whether the author

@@ -65,8 +65,8 @@ def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
 
 
 def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(P, 3) corners of the points' convex hull. If they have none (they lie in one plane, or are not
-    finite), the corners of the box around them."""
+    """(P, 3) corners of the points' convex hull; corners of the box around the points if they have no hull
+    (they lie in one plane, or are not finite)."""
     try:
         return np.asarray(hull_points(points), np.float64)
     except (QhullError, ValueError):

@@ -55,11 +55,11 @@ class LeanMaterials:
         """Number of texels read so far."""
 
     def lean_copy(self, body: Any) -> LeanBody | None:
-        """A copy of a body without its constant metallic textures; None if it has none, or has a mesh that is
-        not from a file.
+        """A copy of a body without its constant metallic textures; None if the body has no such texture, or
+        has a mesh that is not from a file.
 
-        In SAPIEN, a mesh that is not from a file has the same materials as its copies, and no tangents for
-        normal maps.
+        In SAPIEN, a mesh that is not from a file shares its materials with its copies, and has no tangents
+        for normal maps.
         """
         parts = [part for shape in body.render_shapes for part in shape.parts]
         if all(self._metallic(part.material) is None for part in parts):
@@ -104,8 +104,9 @@ class LeanMaterials:
 
 
 def _constant(texture: Any) -> float | None:
-    """The value 0..1 that red and blue have in all texels; None if they differ. SAPIEN reads the metallic
-    value from red of a picture, and from blue of a glTF file's texture, which has the roughness in green."""
+    """The value 0..1 that red and blue have in all texels; None if the values differ. SAPIEN reads the
+    metallic value from red of a picture, and from blue of a glTF file's texture, which has the roughness in
+    green."""
     if texture.is_srgb or texture.format not in _KNOWN_FORMATS:
         return None
     pixels = np.asarray(texture.download())

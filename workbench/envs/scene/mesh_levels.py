@@ -48,8 +48,8 @@ _LARGE_FACES = 20_000
 _CHECKED_POINTS = 1500
 """Points on the exact surface at which the distance to a level is measured."""
 _SEARCHED_POINTS = 10_000
-"""Maximum `count` with which `_points_on` draws points on a level. The triangles of the points nearest to a
-checked point are tried as the nearest."""
+"""Maximum `count` for `_points_on` on a level. The distance from a checked point is measured only to the
+triangles of the points nearest to it."""
 _MAX_MESHES = 500
 """Maximum number of meshes in memory."""
 _MAX_CACHE_BYTES = 512 << 20
@@ -60,7 +60,7 @@ _MAX_CACHE_BYTES = 512 << 20
 class Level:
     mesh: Mesh
     error: float
-    """Distance from the level within which 99 % of the exact surface lie, in the mesh's own units."""
+    """Distance from the level within which 99 % of the exact surface lies, in the mesh's own units."""
 
 
 def content_hash(mesh: Mesh) -> str:

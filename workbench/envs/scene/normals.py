@@ -1,4 +1,4 @@
-"""Computes normals of meshes: from their faces, or such that few triangles are shaded like the exact mesh."""
+"""Computes normals of a mesh: from its faces, or so that a simplified mesh is shaded like the exact one."""
 
 from __future__ import annotations
 
@@ -119,8 +119,8 @@ class ShadedSurface:
     def normals_at(
         self, points: NDArray[np.float64], facing: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(P, 3) for each of `points` (P, 3) a normal of the surface near it, if possible one that faces
-        along `facing` (P, 3); and (P,) whether it does."""
+        """(P, 3) a normal of the surface near each of `points` (P, 3), if possible along `facing` (P, 3); and
+        (P,) whether each normal faces that way."""
         count = min(_NEIGHBOURS, self._tree.n)
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]

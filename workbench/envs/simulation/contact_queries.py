@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 _Key = int | tuple[int, int]
-"""The ``id`` of a body, or the ids of two."""
+"""The ``id`` of a body, or the ids of two bodies."""
 
 
 class CpuArray:

@@ -533,7 +533,7 @@ class BatchedCpuSystem:
         self.contacts.invalidate()
 
     def replace(self, env: int, scene: sapien.Scene) -> None:
-        """Use another scene and system for this env, with its entities in the same order."""
+        """Replace the scene and system of this env; `scene` has the env's entities in the same order."""
         self.scenes[env] = scene
         self.systems[env] = scene.physx_system  # pyright: ignore
         self.stepper.renew(env)
@@ -559,7 +559,7 @@ class BatchedCpuSystem:
         values: NDArray[np.float32],
         write: Callable[[NDArray[np.bool_]], None],
     ) -> None:
-        """Write `values`, which a setter put at the rows and columns `at` of a mirror's tensor, to the simulation too.
+        """Write to the simulation what a setter wrote to a mirror's tensor: `values` at index `at`.
 
         Args:
             write: writes through SAPIEN's objects; called with a mask of the rows to write.

@@ -22,10 +22,10 @@ def install_hiding() -> None:
     """Make ``Actor.hide_visual`` and ``show_visual`` set the visibility in batched CPU scenes; applied once
     per process.
 
-    Stock ManiSkill does so on the CPU too. In GPU simulation it moves an actor 99999 m away and stores its
-    pose. If another struct (an actor that it was merged into) then moves or reads the actor, poses are wrong
-    and the actor is visible again (ManiSkill #1447). In scenes that are not batched, the stock code still
-    runs.
+    Stock ManiSkill does so on the CPU too. In GPU simulation it moves the hidden actor 99999 m away and
+    stores its pose. If another struct (a merged actor that contains it) then moves or reads the actor, poses
+    are wrong and the actor is visible again (ManiSkill #1447). In scenes that are not batched, the stock
+    code still runs.
     """
     stock: property = Actor.__dict__["pose"]
     Actor.pose = property(  # type: ignore[assignment]
@@ -49,8 +49,10 @@ def _in_batched_scenes(ours: Callable[[Any], None], stock: Callable[[Any], None]
 
 
 def why_not_hidden(thing: Any) -> str:
-    """Why ManiSkill cannot hide a member of ``_hidden_objects``, as a clause; empty if it can. Hiding it raises `RuntimeError`
-    in a batched CPU scene, AssertionError or AttributeError in others."""
+    """Why ManiSkill cannot hide a member of ``_hidden_objects``, as a clause; empty if it can.
+
+    Hiding such a member raises RuntimeError in a batched CPU scene, else AssertionError or AttributeError.
+    """
     if not isinstance(thing, Actor):
         return f"it is a {type(thing).__name__}, and only actors can be hidden"
     if thing.merged and "has_collision_shapes" not in vars(thing):

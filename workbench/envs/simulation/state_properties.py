@@ -26,7 +26,7 @@ _POSE, _LINEAR, _ANGULAR = slice(0, 7), slice(7, 10), slice(10, 13)
 
 @dataclass(frozen=True)
 class StateProperty:
-    """A property of a struct, which has a row for each of the struct's objects."""
+    """A property of a struct, with a row for each of the struct's objects."""
 
     owner: type
     """The class that defines it."""
@@ -34,8 +34,7 @@ class StateProperty:
     group: Group
     mirror: MirrorName
     columns: slice
-    """Columns of the mirror's tensor; not used for a property of a joint, whose column is its
-    ``active_index``."""
+    """Columns of the mirror's tensor; a property of a joint uses the joint's ``active_index`` instead."""
     read: Callable[[Any, int], Any]
     """Reads the numbers of the struct's i-th object from SAPIEN."""
     write: Callable[[Any, int, Floats], None] | None = None

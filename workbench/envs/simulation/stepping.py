@@ -17,8 +17,8 @@ import sapien.physx as physx
 class Stepper:
     """Steps N systems lazily: substeps are done when they are needed.
 
-    PickCube-v1, 64 envs, two cores, physics part of a control step of five substeps (the bits are the same in every row,
-    ``tests/envs/simulation/test_stepping.py``):
+    PickCube-v1, 64 envs, two cores, physics part of a control step of five substeps (all variants give the
+    same bits, ``tests/envs/simulation/test_stepping.py``):
 
         one thread, env after env, substep after substep        24 ms
         two threads                                             14 ms
@@ -282,7 +282,7 @@ class EnvThreads:
                 for index in todo:
                     job(index)
             finally:
-                # Also after an exception in this thread: the helpers still use objects of the caller.
+                # Wait even after an exception in this thread: the helpers still use objects of the caller.
                 errors = [helper.end() for helper in working]
             self._helpers = every
         for error in errors:

@@ -215,7 +215,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         super().refresh(group)
         for mirror, was in before:
             held = self._held.get(id(mirror.now))
-            if held is not None:  # on a GPU too, a number that was not written follows
+            if held is not None:  # a GPU would hold the new value of a number that was not written
                 held[...] = np.where(differ(was, held), held, mirror.now)
             if group in self._stale and group not in self._moved_unfetched:
                 moved = differ(mirror.now[mirror.at], was[mirror.at]).any(axis=1)

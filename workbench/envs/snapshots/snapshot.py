@@ -244,7 +244,7 @@ def _require_gpu(env: BaseEnv) -> None:
 def _pairs(
     env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | int | None, source: int | Sequence[int] | None
 ) -> tuple[list[int], list[int]]:
-    """The envs to restore, and the position of each one's source in the snapshot."""
+    """The envs to restore, and for each of them the position of its source env in the snapshot."""
     if env_idx is None and source is not None:
         raise ValueError("source needs env_idx: name the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:

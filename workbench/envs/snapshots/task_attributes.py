@@ -152,8 +152,8 @@ def _putter(container: Any, key: Any) -> Callable[[Any], None]:
 
 @lru_cache(maxsize=4096)
 def _has_members(cls: type, author: str) -> bool:
-    """Whether an object's attributes are searched: those of robots, controllers, the author's classes,
-    dataclasses."""
+    """Whether to search the attributes of objects of this class: robots, controllers, dataclasses and the
+    author's classes."""
     if issubclass(cls, (BaseAgent, BaseController)):
         return True
     if issubclass(cls, (type, torch.nn.Module)) or not cls.__dictoffset__:

@@ -95,7 +95,7 @@ def note_scene(env: BaseEnv) -> None:
 
 
 def note_constructed(env: BaseEnv) -> None:
-    """Mark as part of the scene: the plain values that the task's ``__init__`` set after it called BaseEnv's.
+    """Mark the plain values that the task's ``__init__`` set after ``BaseEnv.__init__`` as part of the scene.
 
     Without this, a restore into an env of the edited file would write the old file's ``self.threshold = 0.02``.
     """
