@@ -149,7 +149,7 @@ of the slider does not draw the pictures of every moment on the way."""
 def apply(run: Run, event: object, now: Now) -> Change:
     """The run after an event, and the effects to perform.
 
-    The history is the only part that is changed in place (see `Past.history`).
+    The history (`Past.history`) is changed in place; nothing else is.
 
     Raises:
         Refused: the command makes no sense now; nothing has changed.
@@ -277,7 +277,7 @@ def _do_command(run: Run, command: Command) -> Change:
         case ChooseEpisodeEnd(rule=rule):
             return _change_settings(run, episode_end=rule)
         case ChooseActions(source=source):
-            # The policy may have no name yet: the next step reports that it is missing.
+            # If no policy was named yet, the next step reports that a policy is missing.
             policy = run.named_policy if source == "policy" else None
             return _change_settings(run, action_source=source, policy=policy)
         case SetPolicy(policy=policy):
@@ -361,8 +361,8 @@ def _show_live(run: Run) -> Run:
 
 
 def _show(run: Run, past: Past | None) -> Run:
-    """The run with `past`, its pictures marked as new. The run unchanged if `past` is None or shows the same
-    moment as before."""
+    """The run with `past`, and with its pictures marked as new. If `past` is None or shows the same moment as
+    before, the run does not change."""
     if past is None or run.past is None or past.shown is run.past.shown:
         return run
     return new_pictures(replace(run, past=past))
@@ -388,7 +388,7 @@ def _change_settings(run: Run, **values: Any) -> Change:
     policy = run.policy
     run = replace(run, settings=new)
     if new.cameras != before.cameras:
-        # A camera that failed is tried again when it is requested again.
+        # A failed camera is tried again after the user unticks it and ticks it again.
         kept = {camera.key for camera in before.cameras} & {camera.key for camera in new.cameras}
         run = replace(
             run, failed_cameras={key: why for key, why in run.failed_cameras.items() if key in kept}

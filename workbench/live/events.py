@@ -238,7 +238,7 @@ class Follow:
 
 @dataclass(frozen=True)
 class FollowPolicy:
-    """Watch the file of this policy, or no file, from now on."""
+    """From now on, watch the file of this policy; None: watch no file."""
 
     policy: str | None
     folder: Path | None

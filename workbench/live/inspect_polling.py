@@ -1,4 +1,4 @@
-"""Polls the selected env while a page inspects it: its joints, contacts, observation or state."""
+"""Polls the joints, contacts, observation or state of the selected env while a page inspects them."""
 
 from __future__ import annotations
 

@@ -120,8 +120,8 @@ class Recovery:
         return replace(self, good=(*self.good[:-1], replace(self.good[-1], idle_crashes=0)))
 
     def failed(self, kept: bool, newest: Newest) -> tuple[Recovery, bool]:
-        """Record that a load failed in a worker that continues. Also returns whether to call `next_load`: the
-        worker has no version now, and an attempt is left."""
+        """Record that a load failed in a worker that continues. Also returns whether to call `next_load`:
+        True if the worker has no version now and an attempt is left."""
         after = replace(self, loading=self.file_waits)
         if kept or not self.loading or self.file_waits:
             return after, False

@@ -50,8 +50,8 @@ def first_requests(run: Run) -> tuple[Run, list[Request]]:
 
 
 def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = None) -> frozenset[Path]:
-    """The files to watch: the task's own file, each of `paths` that is in the task's folder, and `at_fault`
-    in any folder. Empty if the task has no file of its own."""
+    """The files to watch: the task's own file, each of `paths` that is in the task's folder, and `at_fault`,
+    which may be in any folder. Empty if the task has no file of its own."""
     if run.own_file is None or run.own_folder is None:
         return frozenset()
     modules = (Path(p) for p in paths if Path(p).is_relative_to(run.own_folder))
@@ -129,7 +129,7 @@ def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
     past = _past_after(before, event, restored)
     drawn = kept or (past != "gone" and before is not None and pack(before.geometry) == pack(task.geometry))
     if drawn and before is not None:
-        # The same object tells the page that it need not rebuild the scene.
+        # Keep the same object: it tells the page that the scene need not be rebuilt.
         task = replace(task, geometry=before.geometry)
     level, reason = (None, "the first version") if report is None else (report.level, report.reason)
     milliseconds = sum(event.milliseconds.values())
@@ -157,7 +157,7 @@ def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
     if report is None or report.level not in ("same", "patched"):
         run = replace(run, cameras_serial=run.cameras_serial + 1, pictures=run.pictures if kept else {})
         run = new_pictures(run)
-    if not (restored and run.choices):  # with choices, another class may have been chosen since
+    if not (restored and run.choices):  # the user may have chosen another class since
         run = replace(run, choices=(task.chosen, *task.others) if task.others else ())
     if task.others and task.source_files and task.file is not None:
         running = reference_to_class(run.reference, Path(task.file), task.chosen)
@@ -280,8 +280,8 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
 
 
 def _texts(run: Run) -> Mapping[str, str]:
-    """While a version is being loaded: its source by path, empty if unknown. Otherwise: the source of the
-    running version."""
+    """Source by path of the version that is being loaded (empty if unknown), or of the running version if
+    none is being loaded."""
     recovery = run.recovery
     if not recovery.loading:
         return {} if run.task is None else run.task.source

@@ -27,7 +27,7 @@ ReloadLevel = Literal["same", "patched", "cameras", "rebuilt", "restarted"]
 SCENE_KEPT: frozenset[ReloadLevel] = frozenset({"same", "patched", "cameras"})
 """Levels that keep the env, its episodes and its history."""
 EpisodeEnd = Literal["reset", "continue", "pause"]
-"""What happens to an env whose episode ends: reset that env, continue, or pause all."""
+"""What happens when the episode of an env ends: the env is reset, the env continues, or all envs pause."""
 
 
 # --- requests: server to worker, handled in order between control steps ---------------------------
@@ -38,22 +38,24 @@ class Load(Question["Loaded"]):
     """Import and build the task. It replaces the running version only if everything succeeds."""
 
     task: TaskName
-    """A path, ``path:ClassName`` or a registered env id, as the user named it, or a task named by a recording."""
+    """The task as the user named it (a path, ``path:ClassName`` or a registered env id), or a task named by a
+    recording."""
     options: TaskOptions
     source: dict[str, str] | None = None
     """Texts by path to use in place of the files on disk, to restore the last good version."""
     level: LoadLevel = "auto"
     """How to replace a running version of the same task."""
     snapshot: bytes | None = None
-    """Pickled `envs.snapshots.snapshot.Snapshot` to restore after a build, by name, where shapes match."""
+    """Pickled `envs.snapshots.snapshot.Snapshot` to restore after a build. Each value is restored by name, if
+    its shape matches."""
     any_task: bool = False
-    """If no class is named and the first one fails, open another task of the file."""
+    """If no class is named and the first class fails, open another task of the file."""
     number: int = 0
-    """Number of the load of the file on disk, counting up; 0 for a restored version."""
+    """Serial of this load of the file on disk, counting up; 0 for a load that restores a version."""
     because: str = ""
     """Why a new process loads the task, for the `ReloadReport`."""
     same_scene: bool = False
-    """Whether a new process loads the version and its scene-building code is unchanged."""
+    """Whether a new process loads the version, and the version's scene-building code is unchanged."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ class SetSliderAction:
 
     env_idx: tuple[int, ...]
     dimensions: tuple[int, ...]
-    """Dimensions to set; without any, the envs hold still."""
+    """Dimensions to set; if empty, the envs hold still."""
     values: tuple[float, ...]
     """One value for each dimension, the same for each env."""
 
@@ -140,7 +142,7 @@ class ReadPolicyAgain:
 @dataclass(frozen=True)
 class FollowPlan:
     """The answer to a `PlanWanted`: the actions to take from the moment of the `PlanWanted` on. The worker
-    drops the answer if anything else has moved the envs since that moment."""
+    drops the answer if the envs have moved since that moment, or after a `PlanDropped`."""
 
     number: int
     """Number of the `PlanWanted` that this answers."""
@@ -163,7 +165,8 @@ class PlaceCamera(Question["Placed"]):
 
 @dataclass(frozen=True)
 class SetCapture:
-    """Send every step with the batch's state columns and the pictures of all cameras of these envs, for a recording."""
+    """For a recording: send each step with the state columns of the batch, and with the pictures of all
+    cameras in these envs."""
 
     env_idx: tuple[int, ...]
     """Envs to capture; empty turns capturing off."""
@@ -192,7 +195,7 @@ class Restore:
     env_idx: tuple[int, ...]
     """The envs to put back."""
     source: tuple[int, ...]
-    """Env of the snapshot whose state each env of `env_idx` gets."""
+    """For each env of `env_idx`: the env of the snapshot whose state it gets."""
     origin: int
     """The server's number of that moment; returned unchanged."""
     undoes: int | None = None
@@ -258,7 +261,7 @@ class DrawPast:
 
 @dataclass(frozen=True)
 class WarmUp(Question[None]):
-    """Do the slow parts of a process's first load and first picture; see `warm_up`."""
+    """Do the slow parts of a first load and a first picture in advance; see `warm_up`."""
 
     options: TaskOptions
 
@@ -317,7 +320,7 @@ Request = (
 
 def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
     """The waiting requests that remain after an interrupt. A `Play` that starts playing is dropped; a
-    `SingleStep` becomes the pause that it starts with."""
+    `SingleStep`, which pauses and then steps, becomes a pause."""
     for request in requests:
         if isinstance(request, SingleStep):
             yield Play(False)
@@ -345,7 +348,8 @@ class Loading:
 @dataclass(frozen=True)
 class NewProcessNeeded:
     """The worker's answer to a `Load` that needs another process: the running version left something in this
-    process that no reload undoes. The worker ends; the next one loads the file at the newest moment."""
+    process that no reload undoes. The worker ends; the next worker loads the file and restores the newest
+    moment."""
 
     reason: str
     same_scene: bool
@@ -376,9 +380,9 @@ class Loaded:
     milliseconds: dict[str, float]
     """Time of each part of the load: import, build, rehearse, reset, geometry."""
     reload: ReloadReport | None = None
-    """How the version replaced the previous one; None for the first version of a task. With ``same``, ``patched`` and
-    ``cameras`` the scene, its episodes and `first`'s poses are unchanged, and the geometry's visuals, which are
-    large, are left out."""
+    """How the version replaced the previous one; None for the first version of a task. At the levels
+    ``same``, ``patched`` and ``cameras``, the scene, the episodes and the poses in `first` are unchanged, and
+    `task` lacks the visuals of the geometry, because they are large."""
     options: TaskOptions | None = None
     """Options of the `Load`."""
 
@@ -398,8 +402,8 @@ class TaskFailed:
     at_run: bool = False
     """Whether the running version or its policy failed, not a load."""
     spoiled: str = ""
-    """What the failed code left, or may have left, in this process: the worker ends, and the next one restores the version
-    that ran. Empty if the worker continues."""
+    """What the failed code has left, or may have left, in this process; empty if the worker continues. If not
+    empty, the worker ends, and the next worker restores the version that ran."""
 
 
 @dataclass(frozen=True)
@@ -420,7 +424,8 @@ class PlanWanted:
 
 @dataclass(frozen=True)
 class PlanDropped:
-    """The worker no longer waits for a plan: it was paused, or something else moved the envs."""
+    """The worker no longer waits for a plan: playing started or stopped, a version was loaded, or the source
+    of actions or the envs to plan for changed."""
 
 
 @dataclass(frozen=True)
@@ -486,7 +491,7 @@ class Answer:
     why: str = ""
     """Why there is no answer, for the page; empty if there is one."""
     problem: Problem | None = None
-    """Problem of the author's code, if that is the reason."""
+    """Problem of the author's code, if this is why there is no answer."""
 
 
 class CannotAnswer(Exception):
@@ -498,7 +503,7 @@ class Status:
     """Whether and how fast the batch runs."""
 
     playing: bool
-    """Whether the batch is played, after the last `Play` that the worker has handled."""
+    """Whether the batch plays, after the last `Play` that the worker has handled."""
     steps_per_second: float
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float
@@ -522,7 +527,7 @@ class SliderAction:
 
 @dataclass(frozen=True)
 class RulesBroken:
-    """Rules that the running version breaks without stopping; sent when the findings change."""
+    """Broken rules that do not stop the running version; sent when the findings change."""
 
     rows: tuple[Finding, ...]
     more: int = 0

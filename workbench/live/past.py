@@ -200,7 +200,7 @@ class Past:
         return self.seek(before[-1][0] if before else self.history.first)
 
     def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
-        """Stored pictures of the shown moment."""
+        """Stored pictures of this env at the shown moment."""
         moment = self.shown
         if moment is None:
             return {}
@@ -271,7 +271,7 @@ class Past:
         ticks = history.ticks(history.first, history.last)
         low = min(max(low, int(ticks[0])), int(ticks[-1]))
         high = min(max(high, low), int(ticks[-1]))
-        # The first moment at a tick is its control step; the others are resets and jumps after it.
+        # The first moment at a tick is the control step; later moments at the tick are resets and jumps.
         first, end = int(np.searchsorted(ticks, low)), int(np.searchsorted(ticks, high, side="right"))
         here = slice(first, end)
         serials, base = (history.first + first, history.first + end - 1), history.first

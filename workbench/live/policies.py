@@ -46,7 +46,7 @@ class PoliciesListed:
 
 @dataclass(frozen=True)
 class ListPolicies:
-    """Effect: search repeatedly with these arguments in place of the previous ones; stop if None."""
+    """Effect: search repeatedly, with these arguments from now on; None stops the search."""
 
     wanted: Wanted | None
 

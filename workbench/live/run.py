@@ -79,7 +79,7 @@ class Run:
     versions: tuple[tuple[int, TaskDescription], ...] = ()
     """The versions that made the moments of `past`, oldest first, with the serials of their first moments."""
     needed: NewProcessNeeded = NewProcessNeeded("", False)
-    """Why the next worker must be a new process, as reported by the last worker."""
+    """The last worker's reason for the new process, see `NewProcessNeeded`; empty if it gave none."""
     to_enter: RunToEnter | None = None
     """Recorded run to enter as soon as a task is loaded."""
     first_step_due: bool = False
@@ -141,7 +141,7 @@ class Run:
     told: NDArray[np.float32] | None = None
     """(N, A) next action of the sliders; None if unknown."""
     options_refused: TaskOptions | None = None
-    """Options that were applied last and with which the task failed."""
+    """The options that were applied last, if the task failed with them; else None."""
     seed: int = 0
     playing: bool = False
     steps_per_second: float = 0.0
@@ -201,7 +201,7 @@ class Run:
         return None if self.task is None else load_of(self, LoadInputs(dict(self.task.source), None, 0))
 
     def for_worker(self) -> Settings:
-        """Settings for the worker: without cameras if no page is open."""
+        """Settings for the worker: without failed cameras, and without any camera if no page is open."""
         cameras = tuple(one for one in self.settings.cameras if one.key not in self.failed_cameras)
         return replace(
             self.settings,

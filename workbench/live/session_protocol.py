@@ -23,7 +23,7 @@ class LiveSession(Protocol):
         ...
 
     def do(self, command: Command, page: str = "") -> None:
-        """Carry out a command. Raises `Refused` where it makes no sense now."""
+        """Carry out a command. Raises `Refused` if the command makes no sense now."""
         ...
 
     def happen(self, event: Any) -> None:
@@ -35,11 +35,12 @@ class LiveSession(Protocol):
         ...
 
     def view(self) -> SessionView:
-        """A snapshot of one moment."""
+        """A snapshot of the present state."""
         ...
 
     def look(self, read: Callable[[Run], Value]) -> Value:
-        """The result of `read` for the present run. `read` runs on the loop, which writes the history."""
+        """The result of ``read(run)`` for the present run. `read` runs on the loop, because the loop
+        writes the history."""
         ...
 
     def env_rows(self) -> EnvRows | None:

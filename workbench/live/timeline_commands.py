@@ -54,8 +54,8 @@ class Seek(Command, frozen=True):
 
     step: int
     episode_only: bool = False
-    """Look for the step only in the shown episode of the selected env. The step at which an episode begins is also the
-    last one of the previous episode."""
+    """Look for the step only in the shown episode of the selected env. The step at which an episode
+    begins has the same number as the last step of the previous episode."""
 
 
 class SeekBack(Command, frozen=True):

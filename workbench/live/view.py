@@ -80,7 +80,7 @@ class SessionView:
     options: TaskOptions = TaskOptions()
     """How the envs are made, apart from the seed in these options: the seed in use is `SessionView.seed`."""
     options_refused: TaskOptions | None = None
-    """Options that were applied last and with which the task failed."""
+    """The options that were applied last, if the task failed with them; else None."""
     seed: int = 0
     pages: int = 0
     """Number of open pages."""

@@ -93,7 +93,7 @@ class Column(NamedTuple):
     group: Group
     name: str
     part: int | None = None
-    """Index of the number in an entry with several numbers; None in an entry with one."""
+    """Index of the number in an entry with several numbers; None if the entry has only one."""
 
     @property
     def label(self) -> str:
@@ -176,8 +176,8 @@ def number_of(step: StepResult, column: Column, env: int, joints: Sequence[str] 
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """L lines over steps, cut into B spans of equal width. The minimum and maximum of each span are kept, so that a peak of
-    one step stays visible."""
+    """L lines, with one number per step, cut into B spans of equal width. The minimum and maximum of each
+    span are kept, so that a peak of one step stays visible."""
 
     width: int
     """Number of steps in a span; the last span may have fewer."""
@@ -229,9 +229,10 @@ class Spans:
 
 
 def spans_of(values: NDArray[np.floating], most: int = _MAX_SPANS, first: int = 1) -> Spans:
-    """Whole lines (L, T) cut into at most `most` spans.
+    """Cut lines into at most `most` spans.
 
     Args:
+        values: (L, T) the whole lines.
         first: the step of the first number.
     """
     lines, count = values.shape

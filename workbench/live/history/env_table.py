@@ -35,7 +35,7 @@ EnvEvent = Literal["failed", "flagged"]
 
 @dataclass(frozen=True)
 class LastEpisode:
-    """For each env: of the episodes before the present one, the last that ended or had outliers.
+    """For each env: the last episode, before the present one, that ended or had outliers.
 
     Envs are reset as soon as an episode ends, so "failed" would never be visible in the row of the present episode.
     """
@@ -84,8 +84,8 @@ class EnvRows:
     succeeded: NDArray[np.int64]
     """(N,) number of the ended episodes that ended in success."""
     failed: NDArray[np.int64]
-    """(N,) number of the ended episodes that ended by fail, or were terminated without success. The rest reached the time
-    limit."""
+    """(N,) number of the ended episodes that ended by fail, or were terminated without success. The episodes
+    counted neither here nor in `succeeded` reached the time limit."""
     rewards: NDArray[np.float32]
     """(N, `KEPT_REWARDS`) rewards, oldest first; NaN before the episode's start. (N, 0) in a moment of the history."""
 
@@ -95,7 +95,7 @@ class EnvRows:
 
     @property
     def first_true(self) -> dict[str, NDArray[np.int32]]:
-        """`first` of the entries of ``evaluate``."""
+        """The part of `first` that is about entries of ``evaluate``."""
         return {what: steps for what, steps in self.first.items() if isinstance(what, str)}
 
     @staticmethod
@@ -160,7 +160,7 @@ class EnvTable:
     def add(
         self, stepped: Stepped, then: EnvRows | None, rewards_then: Callable[[int], NDArray[np.float32]]
     ) -> EnvRows:
-        """Add one event: a reset of some envs, a jump back, or a control step of all.
+        """Add one event: a reset of some envs, a jump back, or a control step of all envs.
 
         Args:
             then: the rows at the moment that some envs went back to. None without a jump back, or if that moment is
@@ -301,7 +301,7 @@ class EnvTable:
 
 
 def _flags(step: StepResult) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """The bool entries (N,) of ``evaluate``, and success and fail of any type."""
+    """Names and masks (N,) of the bool entries of ``evaluate``; success and fail may have any type."""
     for name, values in step.evaluate.items():
         if name in ("success", "fail") or (values.dtype == np.bool_ and values.ndim == 1):
             yield name, values.reshape(len(step.reward), -1)[:, 0].astype(bool)

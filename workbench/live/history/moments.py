@@ -46,7 +46,8 @@ class SnapshotPartSet:
 
     keys: tuple[int, ...]
     content: tuple[bytes, ...] | None
-    """Bytes of the parts; None if some parts went to another history: then the moment has no snapshot."""
+    """Bytes of the parts; None if some of them were sent to another history; the moments then
+    have no snapshot."""
     moments: int = 0
     """Number of moments with these parts."""
 
@@ -55,7 +56,8 @@ class SnapshotParts:
     """Reference-counted store of snapshot parts.
 
     A snapshot has a body and parts (`envs.snapshots.packing`), and shares most parts with the previous
-    moment. So moments refer to a set of parts, sets count their moments, and parts count their sets.
+    snapshot. Each moment refers to a set of parts. The store counts the moments that use each set, and the
+    sets that use each part.
     """
 
     def __init__(self) -> None:
@@ -138,8 +140,8 @@ class Moment:
 
 
 EnvMoment = tuple[Moment, int]
-"""A moment of an env's episode, and the index of the episode's row in that moment. Where the episode was
-continued from another env's moment, this is the index of that other env."""
+"""A moment of an env's episode, and the row of this episode in the moment's arrays. If the env continued from
+another env's moment, this is the other env's row in that moment and in earlier ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,10 +174,10 @@ class ShownMoment:
 class History:
     """The moments of one built task, oldest first, append-only. Not thread-safe: used on the loop.
 
-    A reset is a separate moment, and so is going back: the envs *jump*, and new moments follow the jump. The moments that
-    the envs left are kept, and the envs can go back to them; undo goes back to the moment before a jump. A
-    *segment* is a run of an env's moments without a jump: it starts from a snapshot and has all actions, so
-    it can be replayed. An *episode* starts at a reset and continues through jumps back.
+    A *jump* of an env is a reset or a return to an earlier moment (a jump back); it is a separate moment. The
+    moments before a jump are kept, and the env can go back to them; undo goes back to the last of them.
+    A *segment* reaches from one jump of an env to its next jump: it starts from a snapshot and has all
+    actions, so it can be replayed. An *episode* starts at a reset and continues through jumps back.
 
     Memory is bounded. First, the oldest pictures are dropped, until pictures use at most half of the limit;
     then the oldest moments are dropped.
@@ -186,9 +188,9 @@ class History:
     ) -> None:
         """
         Args:
-            table: the table of envs, without events so far.
+            table: a table of envs that has no events yet.
             limit: memory limit in bytes; the newest moment is always kept.
-            first_serial: the number of the first moment.
+            first_serial: serial of the first moment.
             joints: names of the joints of `StepResult.qpos`.
         """
         self._table, num_envs = table, table.rows().num_envs
@@ -352,7 +354,7 @@ class History:
         return self._table.rows()
 
     def rows_at(self, moment: Moment) -> EnvRows:
-        """The table of envs at a moment."""
+        """The table of envs at a moment, with the rewards that `Moment.rows` lacks."""
         rewards = np.full((self.num_envs, KEPT_REWARDS), np.nan, np.float32)
         for env in range(self.num_envs):
             known = self._rewards_until(env, moment, KEPT_REWARDS)
@@ -453,7 +455,8 @@ class History:
         return tuple(episode_backwards[k] for k in chosen)
 
     def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
-        """The episode of this env up to a moment, newest first; a jump back continues at the moment that it led to.
+        """The episode of this env up to a moment, newest first. At a jump back, it continues with the
+        jump's origin.
 
         Yields each control step, and finally the reset that began the episode, as far as they are kept.
         """
@@ -484,8 +487,9 @@ class History:
         return None
 
     def _moments_back(self, env: int, serial: int) -> Iterator[EnvMoment]:
-        """The kept moments that led this env to `serial`, newest first: its control steps and its own jumps; after a jump
-        come the moments that led to its origin."""
+        """The kept moments that led this env to `serial`, newest first: its control steps and its own jumps.
+        A jump back is followed by its origin (the moment to which the env went back), and by the moments
+        that led there."""
         while (moment := self.at(serial)) is not None:
             jump, serial = moment.restored, moment.serial - 1
             if not moment.jumped.any():
@@ -498,8 +502,8 @@ class History:
     def last_jump(self, env: int) -> Moment | None:
         """The jump that led this env to its present state, if it can be undone.
 
-        After an undo the env is in the state before the undone jump, so the search continues before that jump and skips the
-        moments that the undo left.
+        After an undo the env is in the state before the undone jump. So the search skips the moments from
+        that jump up to the undo.
         """
         until = self.last
         for moment in reversed(self._jumps):

@@ -166,7 +166,7 @@ def kept_html(view: SessionView) -> str:
 
 
 def _stopped(view: SessionView) -> bool:
-    """Whether no worker has a version, and none will start without a command."""
+    """Whether no worker has a version loaded, and no worker will start without a command."""
     lost = view.problem is not None and view.problem.stage == "worker"
     return view.state == "stopped" or (lost and view.state == "error")
 

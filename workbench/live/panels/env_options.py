@@ -41,7 +41,7 @@ LABELS = {
 }
 NONE = "none (null)"
 _MIN_DECIMALS, _MAX_DECIMALS = 4, 9
-"""Minimum and maximum number of decimals of the step by which an arrow key changes a number."""
+"""Minimum and maximum number of decimals of the increment by which an arrow key changes a number."""
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
@@ -91,7 +91,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
         if made != before:
             self._made = made
             self._build(made[0])
-            # Values that were entered while the first version was loading stay.
+            # A number of envs that was entered while the first version was loading stays.
             if before is None or before[1] != made[1]:
                 self._num_envs = made[1].num_envs
         self._envs.show(self._num_envs)
@@ -245,7 +245,7 @@ def _options(keyword: Keyword) -> dict[str, Plain]:
     """Values in JSON by label."""
     texts = keyword.choices or ("true", "false")
     names = [shown(text) for text in texts]
-    # The labels of 1 and "1" are equal: then all options are labelled in JSON.
+    # If two labels are equal, as those of 1 and "1", all options are labelled in JSON.
     options: dict[str, Plain] = dict(zip(names if len(set(names)) == len(names) else texts, texts))
     if keyword.optional and "null" not in texts:
         options[NONE] = "null"
@@ -253,7 +253,7 @@ def _options(keyword: Keyword) -> dict[str, Plain]:
 
 
 def _step(value: float) -> float:
-    """Step by which an arrow key changes a number of this size."""
+    """Increment by which an arrow key changes a number of this size."""
     if isinstance(value, int):
         return 1.0
     size = math.floor(math.log10(abs(value))) if value else 0

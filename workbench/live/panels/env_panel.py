@@ -54,7 +54,7 @@ WORDS = {
     Outcome.TRUNCATED: "time limit",
 }
 TABLE = "envs"
-"""Name of the panel in the page's report that the panel was unfolded."""
+"""The panel's name in `TellUnfolded`."""
 MAX_DEFAULT_ENTRIES = 6
 """Maximum number of bool entries with a column by default; with more, a row is wider than the view."""
 CURVE_POINTS = 40

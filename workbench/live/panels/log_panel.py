@@ -122,7 +122,8 @@ MAX_FILTER_CHARACTERS = 200
 
 
 class LogPanel(PagePart[SessionView]):
-    """The last lines that pass the filter; only these are drawn, so that a task that prints in every hook stays cheap.
+    """The last lines that pass the filter. Only these are drawn, so that the panel stays cheap while a task
+    prints in every hook.
 
     Args:
         server: The page.

@@ -133,7 +133,7 @@ class TimeBar(PagePart[View]):
 
 class TimelinePanel(TimeBar[SessionView], MomentPart):
     """The live page's timeline. It counts control steps backwards: 0 is live and -37 is 37 steps ago. So the
-    slider stays at its right end while the simulation runs, and nothing needs to be sent. Dragging shows
+    slider stays at its right end while the simulation runs, and its value need not be sent. Dragging shows
     moments that the session has in memory; the worker draws pictures only after the slider has rested at one
     moment.
     """
@@ -155,7 +155,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._session, self._clock, self._record = session, clock, record
         self._episode_only = False
         self._curve = REWARD.label
-        """Name of the entry on the strip; the reward if the task has no such entry."""
+        """Name of the chosen entry. If the task has no such entry, the strip shows the reward."""
         self._range = (0, 0)
         """Ticks at the slider's ends."""
         self._newest = 0
@@ -189,7 +189,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             case SeekBack(steps=steps):
                 session.do(self._seek_to(self._newest + steps))
             case GoToFirst():
-                # The left end of the slider, where the Home key also moves a focused slider.
+                # Go to the left end of the slider, as the Home key does while the slider has the focus.
                 if self._episode_only:
                     session.do(self._seek_to(self._range[0]))
                 else:

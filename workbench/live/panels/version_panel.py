@@ -100,7 +100,7 @@ def version_html(
         refused: why the file's present text does not run.
         notices: further notes for the author.
         link: links the line at which the file was refused.
-        timeline_cleared: whether that load started a new history.
+        timeline_cleared: whether the load of the running version started a new history.
     """
     return render(
         "version",

@@ -213,7 +213,7 @@ class Background(QuestionClient):
     # --- questions -----------------------------------------------------------------------------------
 
     def has_loaded(self, load: Load) -> bool:
-        """Whether this version is loaded."""
+        """Whether the version of `load` is loaded; False for a level other than ``auto``."""
         return load.level == "auto" and self._loaded == load
 
     async def ensure(

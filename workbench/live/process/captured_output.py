@@ -24,7 +24,7 @@ _LINES_PER_SECOND = 400
 """Maximum number of lines per second that are kept; handling them costs 1 % of a core. Further lines are
 counted and dropped."""
 _BAR_PERIOD_SECONDS = 0.1
-"""Minimum interval of reports of an unfinished line that is overwritten."""
+"""Minimum interval between two reports of an unfinished line that overwrites itself (a progress bar)."""
 _FLOOD_BYTES = 16_384
 """During a flood, only this many bytes at the end of each piece are split into lines."""
 
@@ -198,7 +198,7 @@ def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[StyledText], St
 
 
 def for_terminal(runs: Iterable[StyledText]) -> str:
-    """Escape codes for these runs; the terminal's style is plain after them."""
+    """The text of these runs with escape codes; the terminal's style is plain after it."""
     return "".join(run.style.render(run.text) for run in runs)
 
 

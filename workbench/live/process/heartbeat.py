@@ -46,7 +46,7 @@ class Busy:
     ignores_interrupt: bool = False
     """Whether the worker continued after an interrupt."""
     held: bool = False
-    """Whether a debugger has suspended the worker, or the worker waits for one: it is not hanging then."""
+    """Whether a debugger has suspended the worker, or the worker waits for a debugger. Neither is a hang."""
     awaited: bool = False
     """Whether the worker waits until a debugger attaches."""
 
@@ -228,7 +228,7 @@ class Beat:
     since: float
     """``time.monotonic()`` at the beginning of the work."""
     held: bool = False
-    """Whether a debugger has suspended the worker, or the worker waits for one."""
+    """Whether a debugger has suspended the worker, or the worker waits for a debugger."""
 
     @property
     def seconds(self) -> float:
@@ -237,8 +237,8 @@ class Beat:
 
 
 def make_heartbeat() -> int:
-    """File descriptor of the shared memory, for the child; the caller closes it. Until the child writes,
-    `read` gives ``starting``."""
+    """Make the shared memory. Returns its file descriptor, for the child; the caller closes it. Until the
+    child writes, `HeartbeatReader.read` gives ``starting``."""
     fd = os.memfd_create("workbench-heartbeat")
     os.ftruncate(fd, mmap.PAGESIZE)
     os.pwrite(fd, _LAYOUT.pack(0, time.monotonic(), _DOINGS.index("starting"), 0), 0)

@@ -55,7 +55,7 @@ def total_memory() -> int:
         try:
             total = min(total, int(Path(path).read_text()))
         except (OSError, ValueError):
-            continue  # no such container, or "max"
+            continue  # not in such a container, or its limit is "max"
     return total
 
 
@@ -63,7 +63,7 @@ class FamilyMemory:
     """Memory of all descendants of a process, measured ten times a second.
 
     The server ends a worker above its limit before the OOM killer acts. ``RLIMIT_AS`` does not work: torch and the renderer
-    reserve far more address space than they use, and fail without naming the cause.
+    reserve far more address space than they use, and would fail without naming this limit as the cause.
 
     Pages that a forked child shares with its parent count once: summed resident memory (RSS) would count a worker of
     1 GB with seven children as 8 GB. Reading the proportional set size (PSS) takes milliseconds, so it is read every two

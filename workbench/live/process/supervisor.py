@@ -96,7 +96,7 @@ class Death:
     stack: str
     """The worker's last stack, as faulthandler writes it; may be empty."""
     gives_up: bool
-    """Whether too many workers died in a row: only `Supervisor.replace` starts the next one."""
+    """Whether too many workers died in a row. If so, only `Supervisor.replace` starts the next one."""
 
 
 @dataclass(frozen=True)
@@ -181,13 +181,15 @@ class Supervisor:
     """Runs one worker after another, and reports why each ended.
 
     The author's code may crash its process, exit it, loop for ever or fill the memory; the page must survive that. One
-    thread starts a worker, sends the requests of `first_requests`, forwards its events and checks it ten times a second.
+    thread starts a worker, sends the requests of `first_requests`, forwards the worker's events and checks
+    the worker ten times a second.
     When the worker ends, the thread reports why and continues with the next one: the spare, if there is one.
 
     The supervisor ends a worker whose main thread has ended or whose data is unusable. Otherwise it ends a
     worker in only two cases: memory above the limit, and a load that waits behind work that cannot be
     interrupted, since a corrected file must not wait for a worker that hangs. A busy worker may just be slow:
-    it is reported with its line and left alone. Time during which a debugger holds the worker does not count.
+    it is reported with its line of code, and left alone. Time during which a debugger holds the worker does
+    not count.
     """
 
     def __init__(
@@ -231,7 +233,7 @@ class Supervisor:
         self._begun = False
         """Whether the first requests were sent to the worker."""
         self._late: Load | None = None
-        """Load that was sent before the worker's first requests, perhaps too late to be among them."""
+        """The last load that was sent between two workers; the next `first_requests` may not include it."""
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
         self._lives = 0
@@ -457,7 +459,7 @@ class Supervisor:
             self._end(worker, state)
         self._check_memory(worker, state)
         if beat.held != state.held:
-            # Report at once, and count the time from now: time in the debugger is not the task's.
+            # Report the change at once, and measure from now on: time in the debugger is not the task's.
             state.held, state.held_changed, state.reported = beat.held, now, 0.0
         load_sent = self._load_sent
         if (

@@ -124,7 +124,7 @@ class WorkerProcess:
         while self._heartbeat.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
         pid = self._heartbeat.pid or self._process.pid
-        if pid == 0:  # `os.kill` would signal this process and its group
+        if pid == 0:  # with 0, `os.kill` would signal this process and its group
             raise ProcessLookupError("the worker has not started")
         return pid
 
@@ -137,7 +137,7 @@ class WorkerProcess:
                 self._waiting.pop()
             if len(self._waiting) >= _MAX_REQUESTS:
                 # Drop steps and resets, never the newest request, which may be a load or Pause. A step pauses
-                # first, so a pause takes the place of the dropped ones.
+                # first, so a pause takes the place of the dropped steps.
                 self._waiting = deque(r for r in self._waiting if not isinstance(r, (SingleStep, Reset)))
                 self._waiting.append(Play(False))
             self._waiting.append(request)
@@ -236,10 +236,10 @@ class WorkerProcess:
         with self._wake:
             self._ending = True
             self._wake.notify()
-        # A process that left the group may hold the other end: without this the writer would block for ever.
+        # A process that left the group may hold the other end: without this shutdown, the writer would hang.
         self._line.end.shutdown(socket.SHUT_RDWR)
         self._writer.join()
-        # A worker that is not forked yet has no output, and the fork server holds its pipes while it imports.
+        # A worker that is not forked yet has no output, but the fork server holds the worker's pipes.
         timeout = 1.0 if self._process.pid else 0.0
         for reader in self._readers:
             # A process that left the group may hold the pipe: then the thread that reads the pipe is left
@@ -302,9 +302,9 @@ def _replaces(request: Request, before: Request) -> bool:
 def signal_main_thread(pid: int, number: signal.Signals) -> None:
     """Send a signal to the main thread of a process, where Python's handlers run.
 
-    The kernel delivers a signal for the whole process to any thread, on a busy machine also to a thread of torch or the
-    renderer. CPython 3.11 then records the signal without waking the main thread: an endless loop in the main
-    thread continues until another Python thread wants to run, which may never happen.
+    The kernel may deliver a signal to any thread of a process; on a busy machine this may be a thread of
+    torch or of the renderer. CPython 3.11 then records the signal without waking the main thread: an endless
+    loop in the main thread continues until another Python thread wants to run, which may never happen.
     """
     if _libc.tgkill(pid, pid, int(number)) != 0:
         error = ctypes.get_errno()

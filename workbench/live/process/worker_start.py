@@ -18,8 +18,8 @@ from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, has_come, pack
 
 _GPUS = ("/dev/nvidiactl", "/dev/dxg")
-"""Device files, one of which exists if CUDA may be available (the second in WSL). Then no worker is forked:
-CUDA does not work in a fork of a process that has used it, and any import may use it."""
+"""If one of these device files exists (the second is that of WSL), CUDA may be available, and no worker is
+forked: CUDA does not work in a fork of a process that has used CUDA, and any import may use it."""
 _MAX_MESSAGE_BYTES = 1 << 12
 _UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -33,9 +33,10 @@ class NewWorker:
 
 @dataclass(frozen=True)
 class Forked:
-    """A worker was forked: process id of its keeper."""
+    """Report of the fork server: a worker was forked."""
 
     pid: int
+    """Process id of the worker's keeper."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class WorkerForks:
                 try:
                     return _forked(control, fds, niceness)
                 except (BrokenPipeError, ConnectionResetError):
-                    self._end()  # the fork server was killed; the next worker starts another
+                    self._end()  # the fork server was killed; the next worker starts a new one
         return start_anew(fds, niceness)
 
     def end(self) -> None:
@@ -148,7 +149,8 @@ class WorkerForks:
             self._end()
 
     def _fork_server(self) -> socket.socket | None:
-        """Socket of the fork server; None if the environment or the working directory has changed since it was started."""
+        """Start the fork server, unless it runs, and return its socket. None if the environment or the
+        working directory has changed since it was started."""
         present = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
             self._process, self._control = start_with_socket("workbench.app.worker.fork_workers", present[0])

@@ -39,9 +39,9 @@ def go_back(
     on each other (`envs.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures the
     difference). But an episode begins without internal state (`envs.snapshots.snapshot.begin_anew`), and so
     does a run from a restored moment. These are exact points: the same actions lead from them to the same
-    moment, contacts included. The replayed state is compared with the moment byte by byte; if they differ
-    (edited code, a task that draws numbers for the whole batch), the state is restored. State outside PhysX
-    comes from the moment's snapshot in both cases.
+    moment, contacts included. The replayed state is compared with the moment byte by byte. If the two
+    differ (the code was edited, or the task draws random numbers for all envs at once), the moment's state is
+    restored. State outside PhysX comes from the moment's snapshot in both cases.
 
     Args:
         on_step: called with the number of steps replayed so far, and with the number of all steps to replay.
@@ -59,7 +59,7 @@ def go_back(
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
         if replayed:
-            # All replayed envs in one call: only a call for the whole batch restores the random generators.
+            # All requested envs in one call: only a call for the whole batch restores the random generators.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
             whole = own and snapshot.num_envs == env.num_envs == len(every)

@@ -98,8 +98,8 @@ class Shares:
             self._spent.popleft()
 
     def of(self, what: str, now: float) -> float:
-        """The share (0 to 1) of the window that work of kind `what` took; of the time since `clear`, if that
-        is shorter than the window."""
+        """The share (0 to 1) that work of kind `what` took of the last `window` seconds, or of the time since
+        `clear` if that is shorter."""
         begin = max(now - self.window, self._since)
         spent = sum(
             min(seconds, at - begin) for at, name, seconds in self._spent if name == what and at > begin

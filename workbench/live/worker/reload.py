@@ -66,10 +66,11 @@ def load_version(
 
     ``same`` and ``patched`` keep the env and give it the new class; ``cameras`` also rebuilds its cameras.
     ``rebuilt`` builds another env, which takes over the state by name; the caller closes the old env.
-    ``restarted``: the env of a new worker takes over a snapshot that the server kept. In each case the new
-    version is tried first: on a copy of the current moment if only reward, evaluate or observation changed;
-    also with a reset and a step, which are undone, if the code of resets or steps changed. No picture may be
-    in progress.
+    ``restarted``: the env of a new worker takes over a snapshot that the server kept.
+
+    A new env is rehearsed before it takes over (`build_task`). In a kept env, the changed hooks of resets and
+    steps are called and undone (`rehearse_hooks`); then evaluate, observation and reward are computed for the
+    present state, except at the level ``same``. No picture may be in progress.
 
     Raises:
         TaskError: the version does not work. If its code ran, the process must end: the effects of
@@ -81,7 +82,7 @@ def load_version(
     try:
         return _bring_in(request, running, before, loaded, opening)
     except TaskError as error:
-        # The user who has chosen a task of the file, or runs it, needs no advice about the other tasks.
+        # A user who has chosen this task, or runs it already, needs no advice about the file's other tasks.
         knows_others = False
         if running is None:
             found = _open_another(request, loaded, error, opening)
@@ -236,7 +237,7 @@ def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
 
 
 def _earlier_modules(before: LoadedTask, request: Load) -> dict[str, str]:
-    """Present texts of the previous version's modules, which the hooks of both versions may import late."""
+    """Present texts of the previous version's modules. Hooks of both versions may import them later."""
     texts: dict[str, str] = {}
     for path in before.source:
         given = (request.source or {}).get(path)

@@ -42,14 +42,14 @@ class StepEvents:
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
-        """Start again for another env, which does not share the snapshot parts that were sent."""
+        """Start again for a new env: its snapshots share no parts with those that were sent."""
         self.capture((), from_reset=False)
         self._packer = SnapshotPacker()
         self._columns_fail = False
         self._undrawable.clear()
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
-        """Start or stop capturing, see `SetCapture`. Those of `env_idx` that are captured now continue."""
+        """Start or stop capturing, see `SetCapture`. Envs that are captured now do not wait for a reset."""
         begun = self._recording & set(env_idx) if from_reset else set(env_idx)
         self._recording, self._from_reset = begun, set(env_idx) - begun
 
@@ -82,7 +82,7 @@ class StepEvents:
         """The next event; see `Stepped` for the arguments.
 
         Args:
-            on_failed: called with a camera that cannot be drawn, which is recorded without pictures.
+            on_failed: called for each camera that cannot be drawn; the recording lacks its pictures.
         """
         self.number += 1
         captured: tuple[Picture, ...] = ()
