@@ -37,8 +37,8 @@ from workbench.task.reference import find_module, named_file, split_reference
 class ActionChooser:
     """Chooses the action of every control step for the page's batch.
 
-    One generator for the whole batch draws the random actions and the seeds of new episodes. After a reset
-    with the session's seed, all of them repeat. The random actions of one env depend on the number of envs.
+    One generator for the whole batch draws the random actions and the seeds of new episodes. `seed` restarts
+    it, so that the same actions and seeds follow. The random actions of one env depend on the number of envs.
     """
 
     def __init__(self, folder: CurrentFolder) -> None:
@@ -94,7 +94,8 @@ class ActionChooser:
         """(N, A) action of the next control step. Only the action of a policy may be outside of the bounds.
 
         Raises:
-            TaskError: the policy raised, returned no action, or cannot be imported. The next call imports it again.
+            TaskError: the policy raised, returned no action, or cannot be imported. The next call imports the
+                policy again.
         """
         if self._source == "random":
             return actions.random_action(task.parts, task.num_envs, self._rng)
@@ -110,8 +111,8 @@ class ActionChooser:
         return actions.hold_action(task.parts, task.num_envs)
 
     def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) action from the sliders. A joint target keeps its last value (action or slider), a delta or
-        velocity its slider value. A dimension without such a value holds still."""
+        """(N, A) action from the sliders. A joint target keeps its last value, from an action or a slider. A
+        delta or velocity keeps its slider value. A dimension without a value holds still."""
         low, high = actions.bounds(task.parts)
         action = actions.hold_action(task.parts, task.num_envs)
         is_target = actions.is_target(task.parts)
@@ -248,8 +249,8 @@ class RecordActionChooser:
 
 
 class PlannedActions:
-    """Plans the actions of a batch, each episode independently of the other episodes, and records the returns
-    of the rollouts."""
+    """Plans the actions of a batch, and records the returns of the rollouts. Each episode is planned
+    independently of the others."""
 
     def __init__(
         self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
@@ -274,7 +275,7 @@ class PlannedActions:
         """The source's name in a recording."""
 
     def begin(self, env: int, seed: int) -> None:
-        """Begin an episode in this env, with candidates that are sampled from this seed."""
+        """Begin an episode in this env; `seed` seeds the sampling of the planner's candidate actions."""
         self._planner.reset([env], seed)
         self._logs[env] = EpisodeLog(seed, self._planner.horizon)
 
@@ -283,7 +284,7 @@ class PlannedActions:
 
         Raises:
             TaskError: the task raised in a rollout.
-            NotAlike: the task builds different bodies in each env.
+            NotAlike: the envs of the rollouts have other bodies than one of these envs.
         """
         for env in env_idx:
             self._planner.require_alike(env)
@@ -362,7 +363,7 @@ def _folder_of(task: str) -> Path | None:
 
 @dataclass(frozen=True)
 class Needed:
-    """Files of the author that a job needs."""
+    """The author's folders and files that a job needs."""
 
     folders: tuple[Path, ...]
     files: tuple[Path, ...]
@@ -409,20 +410,20 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
 
 
 MAX_BYTES = 2**30
-"""Maximum size of a NumPy file, packed and unpacked; enough for 20 million steps of a Panda."""
+"""Maximum size of a NumPy file, also after decompression; enough for 20 million steps of a Panda."""
 SUFFIXES = (".npy", ".npz", ".h5")
 
 
 def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
-    """Read a file of actions: a run for each episode, and the keyword arguments that the env needs, such as
-    the control mode.
+    """Read a file of actions. Returns a run for each episode, and the keyword arguments that the env needs,
+    such as the control mode.
 
     ``.npy``: one array (T, A) for all episodes, or an array (E, T, A) with one (T, A) per episode. ``.npz``:
     an array (T, A) per episode. ``.h5``: trajectories of ManiSkill, or a recording of the workbench; their
     runs also have a seed and env states. The states correct a replay whose own states deviate from the
     recorded ones, for example on another machine, in another version, or in a GPU batch that was seeded as a
-    whole. As in ManiSkill's ``replay_trajectory``, an episode of a file does not stop at success or at the
-    time limit.
+    whole. As in ManiSkill's ``replay_trajectory``, an episode that replays a file does not stop at success or
+    at the time limit.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -30,7 +30,7 @@ from workbench.task.watch import SourceWatcher
 
 Policy = Callable[[Any], Any]
 """Takes the task's batched observation in the task's ``obs_mode``. Returns an array or tensor: (N, A), or one
-action (A,) for all envs. For several robots it returns a dict with one of these per robot."""
+action (A,) for all envs. For several robots it returns a dict with such an array for each robot."""
 
 _warned: set[Path] = set()
 """Files named like a library, for which a warning was printed."""
@@ -101,8 +101,8 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
 
 
 def _hint(name: str, attribute: str, task_folder: Path | None) -> str:
-    """End of the message for a missing function. If a file of this name exists, but a library's module of the same
-    name was imported instead, it says how to refer to the file."""
+    """End of the message for a missing function: how to refer to the file ``<name>.py`` if a library's module
+    of that name was imported instead; empty if there is no such file or no such module."""
     for folder in (Path.cwd(), task_folder or Path.cwd()):
         file = folder / f"{name}.py"
         if file.is_file() and is_library(name):
@@ -125,8 +125,7 @@ class _PolicyLoader(importlib.machinery.SourceFileLoader):
 def policy_problem(
     error: BaseException, reference: str, task_folder: Path | None = None, policy: Policy | None = None
 ) -> Problem:
-    """The problem of a policy, at a line of its module or of another file of the author's that the policy
-    calls.
+    """The problem of a policy, at a line of its module or of the author's other code that it calls.
 
     Args:
         task_folder: as in `load_policy`.
@@ -217,7 +216,7 @@ def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
     try:
         tree = parse_python(read_regular_file(file, _MAX_FILE_BYTES))
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
-        return []  # an unreadable file lists no policy; choosing it by name reports the reason
+        return []  # its policies are not listed; loading one by name reports the reason
     found = []
     for node in tree.body:
         if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):

@@ -32,7 +32,7 @@ class Layout:
     layout, stored once, describes them. A layout is a numpy structured type, so one call converts a thousand
     rows to columns.
 
-    A packer makes one object per key: compare layouts by identity.
+    A packer makes only one `Layout` per key, so layouts are compared by identity.
     """
 
     key: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
@@ -136,8 +136,9 @@ def _column(parts: Sequence[NDArray | int]) -> NDArray:
 
 # --- entries of evaluate() that are not numbers ----------------------------------------------------
 #
-# A string or None rarely changes from state to state, so the journal gets a line only at changes. These lines go
-# into the recording's description, which a library reads for thousands of recordings: their size is bounded.
+# A string or None rarely changes from state to state, so the journal gets a line only at changes. The size of
+# these lines is bounded: they go into the recording's description, and a library reads thousands of
+# descriptions.
 
 TEXT = "entry"
 """Kind of a journal entry that holds a text."""

@@ -66,7 +66,7 @@ class WrongDocument(ValueError):
 
 
 class CameraJson(Struct, frozen=True):
-    """A camera's parameters, without its position in the task's source."""
+    """A camera's parameters: a `CameraInfo` without `settings`, `varies` and `site`."""
 
     name: Name
     kind: CameraKind
@@ -153,10 +153,11 @@ class Description(Struct, frozen=True, kw_only=True):
     source_file: PathText | None
     """The name of the task's file."""
     source: Annotated[dict[PathText, str], Entries] | None
-    """Text by path relative to the task's folder. None in the ``.rrd``, which holds the texts separately."""
+    """Texts of the task's Python files, by path relative to the task's folder. None in the ``.rrd``, which
+    holds the texts separately."""
     side_files: Annotated[dict[PathText, Name], Entries] = {}
-    """Hash by path (relative to the task's folder) of other files that the task reads. The recording does not
-    hold these files."""
+    """Hashes of other files that the task reads, by path relative to the task's folder. The recording does
+    not hold these files."""
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
     moved_cameras: tuple[MovedCamera, ...] = ()
@@ -492,10 +493,10 @@ def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str
 
 # --- tags and notes -----------------------------------------------------------------------------------
 #
-# A person typed the tags and notes, and the library's index may be discarded without asking. So they are
-# stored with the recordings: in the `.json` of a workbench recording; in `NAME.notes` for files of other
-# programs, which rewrite their files (ManiSkill's recorder after each episode). `mv NAME.*` moves the
-# `.notes` along.
+# A person typed the tags and notes, and the library's index may be discarded without asking. So tags and
+# notes are stored with the recordings: in the `.json` of a workbench recording, but in `NAME.notes` for files
+# of other programs, which rewrite their own files (ManiSkill's recorder after each episode). `mv NAME.*`
+# moves the `.notes` along.
 
 
 MAX_NOTES_BYTES = 16 << 20
@@ -514,7 +515,7 @@ def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note: str) -> None:
-    """Write tags and note of one trajectory into a ``.notes``; delete the file when none are left.
+    """Write tags and note of one trajectory into a ``.notes``; delete the file if it becomes empty.
 
     Raises:
         OSError: the file cannot be read, or the folder cannot be written to.

@@ -25,8 +25,8 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE = 0
 _UP = 2
 _ZLIB_LEVEL = 3
-"""Compression level of zlib. Level 1 makes no smaller files and takes longer on smooth depth; the default 6 takes three
-times as long (measured)."""
+"""Compression level of zlib. Level 1 has no advantage: its files are not smaller, and smooth depth takes
+longer. The default 6 takes three times as long (measured)."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid, even
-    if only decoding it, in the block, shows this."""
+    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid; the ``with`` block
+    raises it too, if decoding fails there."""
     try:
         with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MAX_PIXELS:

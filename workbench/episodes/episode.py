@@ -25,7 +25,7 @@ Name = Annotated[str, Meta(max_length=1000)]
 PathText = Annotated[str, Meta(max_length=4096)]
 SmallInt = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Seconds = Annotated[float, Meta(ge=1e-4, le=1e3)]
-"""Duration of a control step; the frame rates of films are in the same range."""
+"""Duration of a control step. The frame rate of a film is its inverse: 0.001 to 10,000 per second."""
 MAX_ENTRIES = 10_000
 """Maximum length of every list in a recording: entries of ``evaluate()``, files, actions."""
 MAX_BODIES = 20_000
@@ -99,7 +99,8 @@ class EpisodeInfo:
     recovered: bool = False
     """Whether the recording ends early, because its writer was killed."""
     side_files: Annotated[dict[PathText, Name], Entries] = field(default_factory=dict)
-    """Hash by path (relative to `source_file`'s folder) of other files that the task reads and the recording lacks."""
+    """Hashes of other files that the task reads and the recording lacks, by path relative to `source_file`'s
+    folder."""
     acted_by: ActedBy = ()
     """Sources of the actions: (index of the first action, name such as ``random`` or ``policy act.py:act``). Empty if
     unknown."""

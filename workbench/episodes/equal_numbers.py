@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
-"""Numbers count as equal up to the larger of these differences: a fraction of the largest recorded number,
-and an absolute difference."""
+"""Tolerances, of which the larger one applies: `SAME_SHARE` is a fraction of the largest recorded number,
+`SAME_NUMBER` an absolute difference."""
 
 
 def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:

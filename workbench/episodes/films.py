@@ -27,11 +27,11 @@ from workbench.machine.files import new_file, open_regular_file
 from workbench.pictures.camera_conventions import quaternion_from_axes, quaternion_of, triple, upright
 
 MAX_FRAMES = 100_000
-"""Maximum number of frames of a part of a film."""
+"""Maximum number of frames of a `FilmPart`."""
 MAX_BYTES = 1 << 29
-"""Maximum size of all encoded frames of one part."""
+"""Maximum size of all JPEG frames of a `FilmPart` together."""
 FFMPEG_TIMEOUT_SECONDS = 60.0
-"""Timeout of ffmpeg for one part."""
+"""Timeout of ffmpeg for extracting the frames of a `FilmPart`."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,8 @@ class FilmWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
-            # In its own session: Ctrl-C would make ffmpeg finish the file as if it were complete.
+            # In its own session: if Ctrl-C reached ffmpeg, ffmpeg would finish the file as if it were
+            # complete.
             start_new_session=True,
         )
 
@@ -147,7 +148,7 @@ class FilmWriter:
         self.close(abandoned=error is not None)
 
     def close(self, abandoned: bool = False) -> None:
-        """Finish the file, or with `abandoned` kill ffmpeg. May be called twice."""
+        """Finish the file, or kill ffmpeg if `abandoned`. May be called twice."""
         if self._stderr.closed:
             return
         assert self._process.stdin is not None

@@ -32,8 +32,8 @@ class NoRecordedSource(ValueError):
 
 
 def relative_sources(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The name of the task's own file, and all texts by relative name. No name leads out of the folder: recordings are
-    untrusted.
+    """(name of the task's own file, all texts by name). The names are relative to the task's folder and never
+    lead out of it, because recordings are untrusted.
 
     Raises:
         NoRecordedSource: the source of the task's own file is missing.

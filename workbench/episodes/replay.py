@@ -29,8 +29,8 @@ from workbench.task.load import LoadedTask
 from workbench.task.open import OpenedTask
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
-"""Largest distances from the recorded state that a replay accepts, the second one for rotations of bodies and
-joints; beyond these the replay restores the recorded state."""
+"""Tolerances of a replay: if the position of a body, or the rotation of a body or joint, deviates by more
+from the recorded state, the replay restores that state."""
 
 Way = Literal["re-simulated", "corrected", "put there"]
 
@@ -48,8 +48,8 @@ class ReplayResult:
     corrected: int = 0
     """Number of steps after which the recorded state was restored."""
     start_differs: bool = False
-    """Whether the reset with the recorded seed gave another first state than the recorded one, so that the
-    recorded one was restored."""
+    """Whether the reset with the recorded seed led to another state than the recorded first state, which was
+    then restored."""
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored."""
 
@@ -59,7 +59,7 @@ class Beginning:
     """Result of putting an env into the first state of a run."""
 
     differs: bool
-    """Whether the reset gave another state than the recorded one, so that the recorded one was restored."""
+    """Whether the reset led to another state than the recorded one, which was then restored."""
     missed: dict[str, str]
     """Name and reason of each part of the state that could not be restored."""
 
@@ -67,8 +67,8 @@ class Beginning:
 def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
     """Put these envs into the first state of their runs: reset with the seed, then restore the state if it differs.
 
-    The state may differ if the recorded env was reset together with other envs: they shared torch's
-    generator, so its random numbers depended on more than the seed.
+    The state may differ if the recorded env was reset together with other envs: all of them drew from torch's
+    generator, so the env's random numbers depended on more than its seed.
 
     Raises:
         TaskError: a reset raised.

@@ -193,7 +193,8 @@ def number(value: object) -> float | None:
 def total(value: object) -> float | None:
     """A sum of rewards, which may be NaN or infinite."""
     if isinstance(value, float) and not math.isfinite(value):
-        # Always the same NaN object: NaN != NaN, so compared rows count as equal only if they share it.
+        # Always the same NaN object: NaN != NaN, so two rows count as equal only if they hold the same
+        # object.
         return math.nan if math.isnan(value) else value
     return number(value)
 

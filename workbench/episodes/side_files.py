@@ -29,10 +29,11 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
 
     A recording holds the task's text but not its meshes, which may be larger than all recordings together. The files that
     a task reads cannot be observed, since native libraries open many of them. So the result has each file
-    below the task's folder for which a string in the text names the file or a folder above it, and each file
-    that these files name in turn (as a URDF names its meshes). A file is missed if the code composes its path
-    and no string names its folder. If a string names a folder, its files are included even if the task never
-    reads them. So a change of a side file is only reported: it never prevents anything.
+    below the task's folder that a string in the text names, by its own path or by that of a folder above it,
+    and each file that these files name in turn (as a URDF names its meshes). A file is missed if the code
+    composes its path and no string names its folder. If a string names a folder, the folder's files are
+    included even if the task never reads them. So a change of a side file is only reported: it never prevents
+    anything.
 
     Args:
         task: the task's file. For a file of an installed package the result is empty: the package's version

@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class NoSweep(ValueError):
-    """A file does not hold the results of a sweep; the message follows its name."""
+    """A file does not hold the results of a sweep; the message follows the file's name."""
 
 
 @dataclass(frozen=True)

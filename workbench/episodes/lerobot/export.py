@@ -32,15 +32,14 @@ ROBOT = "robot_uids"
 class ExportOptions:
     choice: Choice = Choice()
     only_successes: bool = False
-    """Leave out episodes without success at any step."""
+    """Leave out episodes that never succeed."""
     only_fitting: bool = False
     """If True, leave out and report episodes that cannot be read or do not fit the first one. If False, such
     an episode raises an error."""
     instruction: str | None = None
     """The task's instruction for language-conditioned policies; None for the task's id."""
     fps: int | None = None
-    """Frames per second; the control rate must be an integer multiple of it. None for the control rate
-    itself."""
+    """Frames per second, of which the control rate must be an integer multiple; None for the control rate."""
 
 
 class DoesNotFit(ValueError):
@@ -53,7 +52,7 @@ class Exported:
     episodes: int = 0
     frames: int = 0
     left_out: int = 0
-    """Episodes without success."""
+    """Number of episodes that `only_successes` left out."""
     not_fitting: list[str] = field(default_factory=list)
     """A sentence for each episode that `only_fitting` left out."""
     notes: list[str] = field(default_factory=list)
@@ -68,8 +67,8 @@ def export_lerobot(
     """Write a dataset of these episodes to a new folder.
 
     Episodes are read and written one by one, so memory use does not grow with their number. A film contains
-    several episodes in a row. The folder gets its name when it is complete, so that a full disk leaves
-    nothing behind.
+    several episodes in a row. The dataset is written to a temporary folder, which is renamed when it is
+    complete and deleted after an error.
 
     Args:
         sources: for each episode a name for messages, and a function that reads it.

@@ -16,7 +16,7 @@ from workbench.episodes.films import cameras_by_name, picture_index
 # As in lerobot 0.4.4 (``lerobot/datasets/utils.py``, ``compute_stats.py``, ``lerobot_dataset.py``), whose reader loads
 # these datasets. ``meta/info.json`` describes the features, ``meta/tasks.parquet`` has the tasks' instructions,
 # ``meta/episodes`` a row per episode (offsets of its frames and films, and its statistics), ``data`` a row per frame,
-# ``videos`` an mp4 per camera with several episodes.
+# ``videos`` mp4 files, each with one camera's pictures of several episodes.
 VERSION = "v3.0"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -145,9 +145,9 @@ class Choice:
 class Frames:
     """Frames of an episode.
 
-    LeRobot has a row per decision: the observation of state t, action t, and the result under ``next.``. So,
-    if every step is kept, row t of our T actions and T + 1 states is state t with action t and the reward of
-    that step; the last state is left out.
+    LeRobot has a row per decision: the observation of state t, action t, and the result under ``next.``. An
+    episode of ours has T actions and T + 1 states. If every step is kept, it becomes T rows: row t has state
+    t, action t and the reward of that step. The last state is left out.
     """
 
     columns: dict[str, NDArray]
@@ -158,14 +158,14 @@ class Frames:
     """(number of frames,) state index of each frame."""
 
     def pictures(self, camera: str) -> Iterator[NDArray[np.uint8]]:
-        """One (H, W, 3) per frame."""
+        """One picture (H, W, 3) per frame."""
         track = cameras_by_name(self.episode)[camera]
         assert track.rgb is not None
         for state in self.states.tolist():
             yield track.rgb[picture_index(track, state)]
 
     def features(self) -> dict[str, dict]:
-        """The features for ``meta/info.json``, without those that every dataset has."""
+        """The features for ``meta/info.json``, without those that every dataset has (`OF_EVERY_FRAME`)."""
         features: dict[str, dict] = {}
         for camera in self.cameras:
             info = cameras_by_name(self.episode)[camera].info

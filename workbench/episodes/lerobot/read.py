@@ -68,8 +68,8 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
 def _of_episodes(
     folder: Path, info: dict[str, Any]
 ) -> tuple[dict[int, float] | None, dict[int, float] | None]:
-    """(sum of rewards by episode, number of frames with success by episode); each of the two is None if the
-    dataset lacks its feature."""
+    """(sum of rewards by episode, number of frames with success by episode); None in place of a dict if the
+    dataset has no rewards or no success."""
     features = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
     if not features:
         return None, None
@@ -88,7 +88,7 @@ def _of_episodes(
 
 
 def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
-    """One number per frame; some datasets store each as a list with one item."""
+    """One number per frame, also if the dataset stores each number as a list with one item."""
     array: Any = column.combine_chunks()
     while pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
         array = array.flatten()
@@ -249,7 +249,7 @@ def _tables(folder: Path) -> list[str]:
 
 
 def _number_type(name: object) -> str:
-    """numpy's name of a number's type; ``O`` for other types."""
+    """`name` if it is the name of a numpy type of numbers, else ``O``."""
     return name if isinstance(name, str) and _NUMBER.fullmatch(name) else "O"
 
 

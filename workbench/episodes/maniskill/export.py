@@ -37,7 +37,7 @@ class Demonstrations:
     episodes: int = 0
     steps: int = 0
     left_out: int = 0
-    """Episodes without success."""
+    """Number of episodes that `only_successes` left out."""
     not_fitting: list[str] = field(default_factory=list)
     """A sentence for each episode that was left out because it cannot be read or does not fit the first
     one."""
@@ -57,8 +57,8 @@ def export_maniskill(
     """Write these episodes to a new ``.h5`` and its ``.json``.
 
     Episodes are written one by one, so memory use does not grow with their number. Observations of the mode ``state`` are one
-    vector (T + 1, D), and observed pictures are in ``obs/sensor_data``, as ManiSkill records them. The files get their names
-    when they are complete.
+    vector (T + 1, D), and observed pictures are in ``obs/sensor_data``, as ManiSkill records them. The files
+    have temporary names until they are complete.
 
     Args:
         sources: for each episode a name for messages, and a function that reads it.
@@ -166,7 +166,7 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
 
 def _flat(episode: Episode) -> Episode:
     """The episode with its state observations joined into one vector, if its `obs_mode` contains ``state``;
-    otherwise the episode is unchanged."""
+    else `episode` itself."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
         return episode

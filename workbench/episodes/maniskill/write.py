@@ -32,10 +32,11 @@ _ORDERED.set_obj_track_times(False)
 def write_h5(episode: Episode, path: Path) -> None:
     """Write `episode` to `path`, which must not exist.
 
-    Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1), one episode per file
-    as ``traj_0``, so programs that read ManiSkill's demonstrations read it: ``actions`` (T, A) float32, ``rewards`` (T,)
-    float32, ``terminated``, ``truncated``, and ``success`` and ``fail`` if the task has them, (T,) bool,
-    ``env_states/{actors,articulations}/<name>`` (T + 1, D), ``obs/...`` (T + 1, ...).
+    Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1), so
+    programs that read ManiSkill's demonstrations can read the file. The only episode is ``traj_0``, with
+    ``actions`` (T, A) float32; ``rewards`` (T,) float32; ``terminated``, ``truncated``, and if the task has
+    them ``success`` and ``fail``, each (T,) bool; ``env_states/{actors,articulations}/<name>`` (T + 1, D);
+    ``obs/...`` (T + 1, ...).
 
     Raises:
         OSError: it cannot be written.
@@ -92,7 +93,7 @@ def _put(parent: h5py.h5g.GroupID, name: str, values: NDArray) -> None:
     packing = _packed(values.shape, row) if row * values.shape[0] >= _MIN_COMPRESSED_BYTES else _PLAIN
     dataset = h5py.h5d.create(parent, name.encode(), kind, space, packing, _MAKES_UTF8)
     if values.size:
-        # Pass the type: otherwise h5py creates it again, which takes longer than writing.
+        # Pass the type: without it, h5py would create the type again, which takes longer than writing.
         dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(values), kind)
 
 

@@ -46,18 +46,18 @@ from workbench.machine.files import NotARegularFile
 
 MAX_STATES = 10_000_000
 MAX_COLUMN_BYTES = 1 << 29
-"""Maximum described size of one column. The size of the file does not limit it, because the file leaves out
-repeated rows."""
+"""Maximum size that a description may claim for one column. A small file can describe a large column, because
+the file leaves out repeated rows."""
 
 
 def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     """The episode of a workbench recording.
 
-    The ``.json`` describes it, the ``.rrd`` holds meshes, poses, pictures and curves, the ``.h5`` env states, observations
-    and actions. A file that is broken or missing is listed in `Episode.broken_files`, and its content is empty: without the
-    .rrd no geometry, poses and pictures, without the .h5 no env states. A lone ``.rrd`` counts as complete:
-    no file is listed as missing. The geometry is that of this env alone, as env 0 of 1. Pictures stay in the
-    file until they are accessed.
+    The ``.json`` describes the recording; the ``.rrd`` holds meshes, poses, pictures and curves; the ``.h5``
+    holds env states, observations and actions. A broken or missing file is listed in `Episode.broken_files`.
+    Without the .rrd, the episode has no geometry, poses and pictures; without the .h5, no env states. A lone
+    ``.rrd`` counts as complete: no file is listed as missing. The geometry is that of this env alone, as env
+    0 of 1. Pictures stay in the file until they are accessed.
 
     Args:
         path: the .rrd, .h5 or .json of the recording.
@@ -230,7 +230,7 @@ def _columns(
 
 
 def _column(table: RerunTable | None, entity: str, kind: ColumnType, first: int, states: int) -> NDArray:
-    """The numbers of `entity` from state `first` on, with dtype and shape of `kind`."""
+    """The numbers of `entity`, a row per state from `first` on. `kind` is the dtype and a row's shape."""
     dtype, shape = np.dtype(kind[0]), (states - first, *kind[1])
     _check_room(entity, shape, dtype)
     out = np.full(shape, np.nan if dtype.kind == "f" else 0, dtype=dtype)

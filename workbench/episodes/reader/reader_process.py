@@ -241,7 +241,7 @@ class Reader:
         paths = (self._folder, *sorted(self._allowed))
         # The process may read the folder that existed when it started, not a new one of the same name.
         there = tuple(map(_identity, paths))
-        # Input without a request means that the process was killed from outside.
+        # EOF or data while no request is pending: the process was killed from outside.
         if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
         if self._line is None:
@@ -274,7 +274,8 @@ class Reader:
             return None
         self._line.end.close()
         self._line, self.process = None, 0
-        # Kills the process's children too. Its id cannot have been reused, because only `exit_code` reaps it.
+        # Kills the reader and its children. The reader's id cannot have been reused, because only `exit_code`
+        # reaps the reader.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
         return fork_server.exit_code(self._pid)

@@ -108,8 +108,8 @@ def read_recording(
     """Read an episode; its pictures are read on access.
 
     Recordings are untrusted, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++ and Rust.
-    So the server never opens them. A confined process with limits on memory and time does; if that process
-    ends or hangs, only this recording fails.
+    So the server never opens them; a confined process with limits on memory and time reads them. If that
+    process ends or hangs, only this recording fails.
 
     Args:
         shapes: shapes to share with other recordings.

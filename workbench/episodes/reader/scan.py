@@ -17,18 +17,19 @@ recording."""
 DATASET_KEY = ["meta", "info"]
 """End of the key of a LeRobot dataset."""
 SETTLE_SECONDS = 3.0
-"""For this long after a change of a folder, a further change may leave the folder's modification time the
-same (the times advance in ticks), and a new recording may still get its other files."""
+"""A folder that changed less than this long ago is scanned again: its modification time advances in ticks, so
+another change may not alter it, and a new recording may still get its other files."""
 MAX_ENTRIES = 500_000
 """Maximum number of names that are listed: the folder may be a home folder."""
 
 
 @dataclass(frozen=True)
 class RecordingFiles:
-    """The files that share one name. Two values differ if a file was written, added or removed in between."""
+    """The files that share one name. The values of two scans differ if a file was written, added or removed
+    between the scans."""
 
     key: str
-    """Path without suffix, relative to the library's folder, with ``/``."""
+    """Path without suffix, relative to the library's folder; ``/`` separates its parts."""
     sizes: dict[str, int]
     """Size in bytes by suffix, in the order of `SUFFIXES`, `NOTES` last."""
     times: dict[str, int]
@@ -73,10 +74,10 @@ def key_of(path: str) -> str:
 class Scan:
     """Result of `scan_folder`.
 
-    A folder's modification time changes when a name in it is added, removed or replaced, which is how
-    recordings are written. So `is_unchanged` only checks the times of folders. These times advance in ticks,
-    so a file that is added within the tick of the last scan would be missed. Therefore a folder with a recent
-    time counts as changed (`fresh`).
+    Writing or deleting a recording adds, replaces or removes names in a folder, which changes the folder's
+    modification time. So `is_unchanged` checks only the times of folders. These times advance in ticks, and a
+    file that is added within the tick of the last scan would be missed. Therefore a folder with a recent time
+    counts as changed (`fresh`).
     """
 
     found: dict[str, RecordingFiles] = field(default_factory=dict)
@@ -84,7 +85,7 @@ class Scan:
     folders: dict[str, int] = field(default_factory=dict)
     """Modification time in nanoseconds of every scanned folder."""
     unsettled: dict[str, RecordingFiles] = field(default_factory=dict)
-    """Files whose ``.json`` may still follow, by key."""
+    """Files of new recordings that have no ``.json`` yet, by key."""
     fresh: bool = False
     """Whether something was written so recently that the folder must be scanned again."""
     problem: str | None = None
@@ -101,7 +102,7 @@ class Scan:
 
 
 def scan_folder(folder: Path) -> Scan:
-    """The recordings in `folder` and the folders below it, without names that begin with a dot and without links to
+    """The recordings in `folder` and the folders below it. Skips names that begin with a dot, and links to
     folders, which may form a cycle."""
     names: dict[str, dict[str, os.stat_result]] = {}
     folders: dict[str, int] = {}

@@ -37,9 +37,9 @@ invisible in the viewer's dark or light theme."""
 def changed_rows(values: NDArray) -> list[NDArray[np.int64] | None]:
     """Rows of `values` (K, R, D) to write, for each of the K series; None for all rows.
 
-    A row that equals both neighbours is left out: the previous row is valid there, and the curve is the same. A row of one
-    number takes 20 bytes besides the number, and most flags change once per episode. First and last row always stay, so
-    that the entity covers the recorded time.
+    A row that equals both neighbours is left out: the previous row stays valid, and the curve is the same.
+    This saves 20 bytes and the number itself for a row of one number; most flags change once per episode. The
+    first and the last row always stay, so that the entity covers the recorded time.
     """
     count, rows = values.shape[:2]
     if rows < 3 or not values.size:
@@ -76,7 +76,11 @@ def property_chunk(name: str, values: Mapping[str, Any]) -> Chunk:
 
 @lru_cache(maxsize=512)
 def series_chunk(entity: str, names: tuple[str, ...], first_color: int = 0) -> Chunk:
-    """Name and colour of each number of the batched scalars of `entity`."""
+    """A chunk with the names and colours of the curves of `entity`, which has one curve per name.
+
+    Args:
+        first_color: index in `SERIES_COLORS` of the first curve's colour.
+    """
     # By default rerun gives all series of an entity one colour, and the entities of a folder similar colours.
     colors = [SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))]
     return static_chunk(entity, rr.SeriesLines(names=list(names), colors=colors))
@@ -87,7 +91,7 @@ class _Column:
     """Replacement of rerun's ``ComponentColumn`` for an Arrow array.
 
     Rerun's archetypes validate and convert their arguments, which for a few hundred rows takes longer than making the
-    chunk. So they are called only once, to get the names and Arrow types of the columns.
+    chunk. So each archetype is called only once, to get the names and Arrow types of its columns.
     """
 
     descriptor: rr.ComponentDescriptor

@@ -40,7 +40,7 @@ cost 5 kB per file and 40 B per step."""
 _MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
 """Maximum pixels and pictures of one chunk, whose pictures are in memory together."""
 _PNG_RGBA = 6
-"""RGBA as the colour type of a PNG, which is byte 25 of the file (PNG specification, section 11.2.1)."""
+"""Value for RGBA of a PNG's colour type, which is byte 25 of the file (PNG specification, section 11.2.1)."""
 FRUSTUM_METRES = 0.12
 """Distance from a camera to its picture in the 3-D view."""
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
@@ -341,8 +341,8 @@ def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype)
 
 
 def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
-    """(entity, names of its curves, rows of numbers) for each entity; there is one row per state, or T rows
-    if the state after the reset has none."""
+    """(entity, names of its curves, rows of numbers) for each entity. There are T + 1 rows, one per state, or
+    T rows for numbers that the state after the reset lacks."""
     found = [
         ("/action", list(episode.action_names), episode.action),
         ("/reward", ["reward"], episode.reward),

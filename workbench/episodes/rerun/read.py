@@ -265,7 +265,7 @@ def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int
     """(states - first,) index of the row that is valid at each state: the state's own row, else the last row
     before it, else -1.
 
-    Equal rows are left out of a file (`chunks.changed_rows`).
+    A file leaves out repeated rows (`chunks.changed_rows`).
     """
     return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 
@@ -280,7 +280,7 @@ def _plain(values: pa.Array) -> NDArray:
 def read_properties(path: Path) -> dict[str, dict[str, Any]]:
     """The properties of the first recording in `path`, by name and component; several values are a list.
 
-    A library needs nothing else of a lone ``.rrd``. A truncated file is read up to its end.
+    A library needs only these from a lone ``.rrd``. A truncated file is read up to its end.
 
     Raises:
         ValueError: `path` holds no recording.
@@ -313,7 +313,7 @@ def store_id(path: Path) -> str:
 
 
 def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
-    """The columns of a chunk without timelines and row ids."""
+    """The columns of a chunk, except timelines and row ids."""
     for field, column in zip(batch.schema, batch.columns):
         if (field.metadata or {}).get(b"rerun:kind") == b"data":
             yield field.name, column
@@ -349,7 +349,8 @@ class OpenFile:
 
     @property
     def path(self) -> Path:
-        """A path for rerun, valid while this object lives: rerun does not open names that are not UTF-8."""
+        """A path that rerun can open, valid while this object lives. Rerun opens only names in UTF-8; for any
+        other name, the path is that of the file descriptor."""
         try:
             os.fspath(self._path).encode()
         except UnicodeEncodeError:

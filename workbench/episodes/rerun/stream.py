@@ -21,8 +21,9 @@ from workbench.episodes.rerun.entities import CAMERAS
 _COPIED_BYTES = 1 << 16
 """Number of bytes that are copied at once: the capacity of a pipe."""
 _one_at_a_time = threading.Lock()
-"""Serializes writers: rerun 0.41 deadlocks if one thread makes a stream while another one ends the threads of streams. And
-two threads that change and restore an environment variable may restore each other's change."""
+"""Serializes writers: rerun 0.41 deadlocks if one thread makes a stream while another thread runs
+`_end_threads`. And if two threads change and restore an environment variable, one may restore the value that
+the other has set."""
 
 
 def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> bytes:
@@ -70,8 +71,8 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
 
 @contextmanager
 def _rerun_enabled() -> Iterator[None]:
-    """Override the user's ``RERUN=off``, which is meant for logging in the user's code, but would make rerun
-    silently write nothing here too."""
+    """Override the user's ``RERUN=off``: it is meant for logging in the user's code, but with it rerun would
+    silently write nothing here."""
     entries = os.environ.get("RERUN")
     if entries is None:
         yield
@@ -84,8 +85,7 @@ def _rerun_enabled() -> Iterator[None]:
 
 
 def _end_threads(application_id: str) -> None:
-    """End the threads of disconnected streams. Otherwise each stream leaves two threads for the life of the
-    process."""
+    """End the two threads that each disconnected stream leaves running."""
     # Do nothing if there is a global recording: `rr.init` would turn it off, and the user's code may log to
     # it.
     if rr.get_global_data_recording() is None and rr.get_thread_local_data_recording() is None:

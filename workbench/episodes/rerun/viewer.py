@@ -243,7 +243,7 @@ def _write_cache(files: dict[str, bytes], folder: Path) -> None:
         made.rename(folder)
     except OSError:
         shutil.rmtree(made, ignore_errors=True)
-        if not folder.is_dir():  # otherwise another process has stored the same files
+        if not folder.is_dir():  # if it exists, another process has stored the same files
             raise
 
 

@@ -300,9 +300,9 @@ def _arrays_of(picture: Picture) -> dict[Modality, NDArray]:
 MAX_PENDING_BYTES = 8 << 20
 """Maximum size of pictures that wait for a thread: a few hundredths of a second of work, which a killed process loses."""
 _BATCH_BYTES = 1 << 20
-"""Pictures are submitted to the threads together, once they have this size. Waking a thread at every step for
-one small picture costs the step as much time as encoding the picture, and with cold caches the encoding takes
-three times as long (measured)."""
+"""Total size from which queued pictures are submitted to the threads together. Waking a thread at every step
+for one small picture costs the step as much time as encoding the picture, and with cold caches the encoding
+takes three times as long (measured)."""
 
 _Pictures = Sequence[tuple[str, int, Modality, NDArray]]
 
@@ -336,9 +336,9 @@ class PendingEntries(Future[list[JournalEntry]]):
 class _EncoderPool:
     """Encodes pictures on a few threads: JPEG and zlib release the GIL.
 
-    Colour, depth and segmentation take 0.5 ms for 128 x 128 and 8 ms for 512 x 512: without threads, each
-    step would wait that long for each camera of each env. The queue is bounded; beyond the limit the caller
-    encodes its own pictures.
+    Encoding colour, depth and segmentation takes 0.5 ms for 128 x 128 and 8 ms for 512 x 512: without
+    threads, each step would wait that long for each camera of each env. The queue is bounded; beyond the
+    limit the caller encodes its own pictures.
     """
 
     def __init__(self) -> None:

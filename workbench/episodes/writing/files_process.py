@@ -76,8 +76,8 @@ class FilesProcess:
             return self._is_ready
 
     def make(self, journal: Journal, header: Header, states: int) -> EpisodeFiles | None:
-        """Run `make_files` in the subprocess, into the folder of the recordings. Returns None if it failed,
-        perhaps after some files were made."""
+        """Run `make_files` in the subprocess, into the folder of the recordings. Returns None if this failed;
+        some files may have been made nevertheless."""
         path = journal.path.absolute()
         try:
             # The descriptor passes on the lock: no process recovers the journal meanwhile, even if this process is killed.
@@ -115,7 +115,10 @@ class FilesProcess:
 
 
 def main() -> None:
-    """``python -m workbench.episodes.writing.files_process SOCKET``. It ends when its socket closes."""
+    """Run the subprocess: ``python -m workbench.episodes.writing.files_process SOCKET``.
+
+    It ends when its socket closes.
+    """
     end = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     scenes: dict[tuple[int, ...], tuple[Visual, ...]] = {}
@@ -136,8 +139,8 @@ def main() -> None:
 
 def _make(what: _Make, scenes: dict[tuple[int, ...], tuple[Visual, ...]]) -> _Made | _NotMade:
     try:
-        # Episodes of a scene share one scene file by hard links: with the same visuals, cached mesh chunks
-        # are reused.
+        # Episodes of a scene share one scene file by hard links. It is read once, because `write_rrd` caches
+        # mesh chunks by visual object.
         path = what.journal.with_suffix(SCENE_SUFFIX)
         file = os.stat(path)
         key = (file.st_dev, file.st_ino, file.st_mtime_ns, file.st_size)

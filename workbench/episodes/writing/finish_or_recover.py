@@ -129,11 +129,11 @@ def remove_episode(folder: Path, task: str, seed: int, id: str) -> None:
 
 
 def recover(folder: Path) -> list[EpisodeFiles]:
-    """Recover recordings from all journals in `folder` whose writer is dead (their lock is free).
+    """Recover recordings from all journals in `folder` whose writer is dead (the journal's lock is free).
 
-    A writer may die while recording, while making files, and between publishing two files of one recording; its journal
-    exists in each case. A journal without a control step is deleted, a damaged one is kept under another
-    name. If one journal fails, the error is raised after the other journals are done.
+    A writer may die while recording, while making files, or between publishing two files of one recording;
+    its journal exists in each case. A journal without a control step is deleted; a damaged journal is kept
+    under another name. If one journal fails, the error is raised after the other journals are done.
 
     Raises:
         RecordingError: files cannot be written, the folder cannot be read, or a journal cannot be read

@@ -317,16 +317,17 @@ _journal_threads = _JournalThreads()
 
 
 def before_writing(flush: Callable[[], None]) -> None:
-    """Call the bound method `flush` before each write, while its object lives, for a caller that batches rows.
+    """Call the bound method `flush` before each write of the journals, until its object is deleted.
 
-    `flush` runs on the journals' thread and must not raise.
+    A caller that batches rows uses this to append them. `flush` runs on the journals' thread and must not
+    raise.
     """
     _journal_threads.flush_first.append(weakref.WeakMethod(flush))
 
 
 class _BoundedFile:
-    """A file for Arrow whose reads are limited to its size: otherwise Arrow would allocate the size that a
-    damaged length claims."""
+    """A file for Arrow. Reads end at the end of the file: Arrow would allocate whatever size a damaged length
+    claims."""
 
     mode = "rb"
 
@@ -373,9 +374,9 @@ class JournalReader:
                 raise
 
     def lost_bytes(self) -> int:
-        """Number of bytes from the incomplete batch at which the last iteration stopped to the end of the
-        file. 0 if no complete batch follows the incomplete one: then the journal is not damaged, only cut
-        short while that batch was being written. Raises OSError."""
+        """Number of bytes from the batch at which the last iteration stopped, which is incomplete, to the end
+        of the file. 0 if no complete batch follows: the journal is not damaged, only cut short while that
+        batch was being written. Raises OSError."""
         size, at = self._file.size, self._end
         while (at := self._find_batch(at + 1, size)) < size:
             try:
@@ -457,7 +458,7 @@ def write_scene(geometry: SceneGeometry, path: Path) -> None:
 
     Meshes must be on the disk from the first row on. They take megabytes (the texture of ManiSkill's table alone 4 MB), and
     sixty-four envs may begin an episode at once, so episodes of one scene share one file by hard links. The format is a
-    numpy archive of plain arrays and a line of JSON, which is validated on reading and executes no code.
+    numpy archive of plain arrays and a line of JSON: reading it executes no code.
     """
     global _last
     with _lock:

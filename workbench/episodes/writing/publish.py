@@ -58,8 +58,8 @@ def sync_files(paths: Sequence[Path]) -> None:
 
 
 def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
-    """Link finished files (``<id>.rrd``, ``<id>.h5`` ...), in order, to the first stem that is free for all
-    of them.
+    """Give finished files (``<id>.rrd``, ``<id>.h5`` ...), in order, their final names: with the first stem
+    of `candidates` that is free for all of them.
 
     The .json comes last: **a recording without a .json does not exist.** Racing processes get different
     names. If the filesystem supports hard links, the temporaries also stay under their old names.
