@@ -53,7 +53,7 @@ class Card:
 
 
 def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
-    """Cards by degree: ``stop``, then ``warn``. Cards with nothing but findings of an earlier version come
+    """Cards by degree: ``stop``, then ``warn``. Cards that hold only findings of an earlier version come
     last.
 
     Args:
@@ -68,8 +68,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
         known = rows[place].finding
         same = known.key == finding.key
         rows[place] = Row(known, _played(finding) if same else f"{_played(finding)}: {finding.message}")
-    # A finding of an earlier version is left out if a row has it already: the checks reach the rules of GPU
-    # simulation last, but playing shows their breaches at once.
+    # Leave out a finding of an earlier version that has a row already. Playing shows a breach of a rule of
+    # GPU simulation at once, but the checks reach these rules last.
     rows += [Row(finding, old=True) for finding in checks.before if _same(finding, rows) is None]
     together: dict[str, list[Row]] = {}
     for row in rows:
@@ -80,8 +80,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
 
 
 def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
-    """Index of the row with the same finding; None if no row has it. For an outlier any row of its rule
-    matches: playing reports an outlier at its hook, the checks report it at its line."""
+    """Index of the row with the same finding; None if there is none. An outlier also matches another row of
+    its rule: playing reports an outlier at a hook, the checks report it at a line."""
     of_rule = [place for place, row in enumerate(rows) if row.finding.rule == finding.rule]
     alike = [place for place in of_rule if rows[place].finding.key == finding.key]
     if not alike and finding.rule in OUTLIER_RULES:
@@ -95,7 +95,8 @@ def count(shown: Iterable[Card]) -> int:
 
 
 def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
-    """Results of the rules without a finding. A rule is left out if playing found a breach of it, even if the checks found none."""
+    """Results of the rules without a finding. A rule is left out if playing found a breach of it, even if the
+    checks found none."""
     broken = {card.rule.id for card in shown if not card.old}
     return [result for result in checks.results if result.rule not in broken]
 

@@ -27,7 +27,7 @@ from workbench.jobs.scheduler import Executor, Failure, Scheduler, ThisProcess, 
 from workbench.task.problem import TaskError
 
 _TRIES = 3
-"""Maximum number of times that a chunk of rules is started when its workers die."""
+"""Maximum number of starts of a chunk of rules. A chunk is started again if its worker died."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class CheckReport:
     comments: tuple[Comment, ...] = ()
     """Silencing comments without effect."""
     missing: int = 0
-    """Number of rules that were not checked, added up over the parts of the seeds."""
+    """Number of items (`job_items.Item`) without a result."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -60,9 +60,9 @@ class CheckReport:
         return tuple(result for result in self.results if result.state == state)
 
     def fails(self, fail_on: FailOn) -> bool:
-        """Whether the check counts as failed. It does if a finding has this degree or a higher one, if the
-        check of a rule failed, or if the author's code raised and no comment silences the rule `runs`. It
-        does not if `fail_on` is ``never``."""
+        """Whether the check counts as failed: a finding has the degree `fail_on` or a higher one, the check
+        of a rule failed, or the author's code raised and no comment silences the rule `runs`. Always False
+        if `fail_on` is ``never``."""
         if fail_on == "never":
             return False
         if self.of_state("failed") or any(fails(finding.degree, fail_on) for finding in self.findings):
@@ -84,14 +84,13 @@ def check(
 
     Args:
         on_activity: gets the name of the current work, for a status line.
-        on_result: gets each result as it comes; several checks may give results of one rule. With several
-            parts of the seeds, a result that a further part may change is left out.
+        on_result: gets each result as it comes; one rule may have several. With several parts of the seeds,
+            results of `RULES_OVER_SEEDS` are left out, since another part may change them.
         stop: called between steps. Once it returns True, the check ends; rules that are not done are missing
             in the report.
         executor: None to run in this process, or in spawned processes if there are several workers.
         began: when the work began, by ``time.monotonic()``; None for now.
-        on_progress: called only with several parts of the seeds; gets the number of rules that are done,
-            added up over the parts.
+        on_progress: gets the number of items that are done; called only with several parts of the seeds.
 
     Raises:
         TaskError: the task or the policy cannot be imported, or the task lacks assets.

@@ -13,7 +13,7 @@ from workbench.envs.gpu_rules import Degree, Finding
 from workbench.task.description import TaskOptions
 
 SEEDS_OF_PART = 32
-"""Seeds that are checked together, in one set of envs."""
+"""Number of seeds in a part. A part has `num_envs` seeds if that is more."""
 
 
 @dataclass(frozen=True)

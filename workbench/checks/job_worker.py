@@ -1,4 +1,4 @@
-"""One process of a check: runs the rules of its chunks on separate envs."""
+"""One process of a check: runs the rules of its chunks on its own envs."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Worker:
         """
         Args:
             runs: recorded runs to replay, from `find_actions`.
-            here: the folder that was current at the start, in which a policy is found.
+            here: the working directory at the start, in which a policy is looked up.
         """
         self._what, self._loaded, self._runs, self._here, self._queue = what, loaded, runs, here, queue
         self._degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
@@ -149,7 +149,8 @@ def _described(loaded: LoadedTask) -> CheckedTask:
 
 
 class _Given:
-    """Acts as ``--actions`` says: a policy runs an episode of each seed, or the episodes of a file are replayed."""
+    """Actor for ``--actions``: a policy runs an episode of each seed, or the episodes of a file are
+    replayed."""
 
     kind = "given"
 
@@ -164,7 +165,7 @@ class _Given:
         """
         Args:
             runs: recorded runs to replay, from `find_actions`; empty for a policy.
-            here: the folder that was current at the start, in which a policy is found.
+            here: the working directory at the start, in which a policy is looked up.
             episodes: indices of the episodes, counted over the whole check.
 
         Raises:

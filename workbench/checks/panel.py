@@ -1,4 +1,4 @@
-"""The Checks tab, and the content of the mark of findings."""
+"""The Checks tab, and the content of the findings mark (`app.marks`)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
 AFTER_SAVE = "After each save"
 AFTER_SAVE_HINT = "Check each version that loads, in a separate process at low priority: playing goes first."
 REST = "rest"
-"""Key of the fold of rules without a finding."""
+"""Key of the foldable part that lists the rules without a finding."""
 
 
 class ChecksPanel(PagePart[SessionView]):
@@ -82,7 +82,7 @@ def _toggle(rule: str) -> ToggleRule:
 
 @dataclass(frozen=True)
 class FindingsMark:
-    """Content of the mark of findings."""
+    """Content of the findings mark, which is visible on every tab."""
 
     count: int
     newest: str
@@ -93,7 +93,7 @@ class FindingsMark:
 
 
 def findings_mark(view: SessionView) -> FindingsMark | None:
-    """The mark of findings; None if there are no findings."""
+    """The findings mark; None if there are no findings."""
     found = cards(view.of(ChecksView), view.played)
     if not found:
         return None

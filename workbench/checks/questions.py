@@ -44,7 +44,8 @@ class CheckGroup(Question[CheckedGroup]):
     degrees: Mapping[str, Degree]
     """Degree of each rule."""
     known: tuple[str, ...] = ()
-    """Rules that already have a result, since a job of higher priority may have interrupted the group."""
+    """Rules to skip because they already have a result. A group is requested again after a job of higher
+    priority interrupted it."""
 
 
 @dataclass(frozen=True)

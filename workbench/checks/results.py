@@ -41,19 +41,19 @@ class Silenced:
 
 @dataclass(frozen=True)
 class Seen:
-    """A row of what a check saw: of one thing, such as a body, in some episodes. `evidence.over_seeds` joins
-    the rows that come from several parts of the seeds."""
+    """A row about one thing, such as a body: what a check saw of it in some episodes. `evidence.over_seeds`
+    joins the rows that come from several parts of the seeds."""
 
     names: tuple[str, ...] = ()
     """Names of the thing, such as a body; empty for the episodes as a whole."""
     place: tuple[str, int, str] | None = None
     """File, line and function at which a breach is reported."""
     tried: int = 0
-    """Number of episodes that the check looked at, or of other things if the rule counts those."""
+    """Number of episodes that the check looked at; some rules count steps or states instead."""
     seeds: tuple[int, ...] = ()
     """Seeds of the episodes that break the rule."""
     count: int = 0
-    """Number of breaches, if they are not counted by episodes."""
+    """Number of breaches, such as bad states; some rules count something else, such as successes."""
     size: float = 0.0
     """Size of the worst breach, in the unit of the rule."""
     numbers: tuple[float, ...] = ()

@@ -29,7 +29,7 @@ class RulePage:
 
 @cache
 def rule_page(rule: str) -> RulePage | None:
-    """The page of a rule; None if it has none."""
+    """The page of a rule; None if the rule has no page."""
     if not _NAME.fullmatch(rule):
         return None
     file = web_assets_folder() / _FOLDER / f"{rule}.md"

@@ -165,8 +165,8 @@ def ended_as(look: Callable[[], None]) -> LookEnd:
 
 def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
     """Run a check. If the task uses something that exists for one env only, run the check again with one env;
-    opening a task does the same. An exception in the author's code, such as a robot's property, becomes a
-    TaskError."""
+    opening a task does the same. An exception in the author's code, for example in a property of a robot,
+    becomes a TaskError."""
     try:
         look()
     except TaskError as error:
@@ -368,7 +368,8 @@ def result_of(
     """The result of a rule, from what its check gave.
 
     Args:
-        rows: rows with code and silencing comment, if this process may have other versions of the files.
+        rows: rows that hold the code and the silencing comment of their places; needed if this process may
+            have other versions of the files.
     """
     known = {row.place: row for row in rows if row.place is not None}
     findings: list[Finding] = []

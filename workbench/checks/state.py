@@ -140,7 +140,7 @@ class EndCheck:
 
 @dataclass(frozen=True)
 class KeepCheckAfterSave:
-    """Store for the next run of the workbench whether each version that loads is checked."""
+    """Store, for the next run of the workbench, whether each version that loads is checked."""
 
     wanted: bool
 

@@ -38,8 +38,8 @@ class PlannedEpisode:
     worst: NDArray[np.float32]
     """(T,) return of the worst rollout among those with a finite return."""
     terms: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """(T,) by name of each term of ``info["reward_terms"]``: the largest minus the smallest of the rollouts'
-    sums of the term."""
+    """(T,) by name of a term of ``info["reward_terms"]``: each rollout sums the term over its steps; the
+    value is the largest of these sums minus the smallest."""
     evaluate: Mapping[str, float] = field(default_factory=dict)
     """Entries of ``evaluate`` at the last step that have one number per env."""
     plan_seconds: float = 0.0

@@ -99,7 +99,7 @@ class Planner:
     def actions(self, env_idx: Sequence[int] | int | None = None) -> Any:
         """The next action for ``env.step``: a tensor (N, A), or a dict of tensors for several robots.
 
-        Begins an env that was not begun with `reset`.
+        Begins an episode, as `reset` does, in each chosen env that has none.
 
         Args:
             env_idx: the envs to plan for, in turn; None for all. The others hold still.

@@ -33,7 +33,7 @@ pictures and no observations."""
 
 
 class NotAlike(ValueError):
-    """The envs of the task are built differently, so that none can stand for another."""
+    """The envs of the task have different bodies, so that no env can stand in for another."""
 
 
 class NothingToPlan(ValueError):
@@ -82,7 +82,7 @@ def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, st
     """Keyword argument of the control mode in which plans are found fastest; empty if `env` uses this mode
     already, if the robot lacks it, or if `given` names a mode.
 
-    In a task about bodies, each of the six dimensions of a hand motion has a direct effect; the motion of a
+    Each of the six dimensions of a hand motion has a direct effect on the bodies of a task; the motion of a
     single joint has none.
     """
     modes = getattr(env.agent, "supported_control_modes", ())
@@ -128,8 +128,8 @@ def make_rollout_env(
     try:
         rolled = build_env(task_class(env), options)
     except Exception:
-        # A task may need a renderer while it builds, for many reasons: only a second try, with a renderer,
-        # shows whether that was the cause.
+        # A missing renderer raises errors of many kinds: only a second try, with a renderer, shows whether
+        # the task needs one.
         if not env.scene.can_render():
             raise
         rolled = build_env(task_class(env), replace(options, render=True))
@@ -305,7 +305,7 @@ def _seed_shared_rng(seed: int) -> None:
 
 
 def _switches(part: actions.ActionPart) -> bool:
-    """Whether a controller is a gripper's: values between open and closed are useless for it."""
+    """Whether the part is a gripper, for which values between open and closed are useless."""
     return isinstance(part.controller, PDJointPosMimicController) and len(part.names) == 1
 
 

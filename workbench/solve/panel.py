@@ -298,7 +298,7 @@ class SolvePanel(PagePart[SessionView]):
 
 
 def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:
-    """Horizon of a plan in seconds, also for the default horizon."""
+    """Horizon of a plan in seconds; the default horizon if `plan.horizon` is 0."""
     return plan.steps(control_dt, has_success) * control_dt
 
 
@@ -334,7 +334,7 @@ def earned(rows: EnvRows, env: int) -> tuple[str, int] | None:
 
 
 def is_flat(plan: PlannedEnv) -> bool:
-    """Whether all rollouts have the same return, and none of them a success."""
+    """Whether all rollouts have the same return and none succeeds."""
     return bool(np.ptp(plan.returns) == 0 and not plan.success_at.any())
 
 

@@ -136,7 +136,7 @@ def _solve(view: SeedsView, run: Run) -> Change:
     if (load := run.running_load()) is None:
         raise Refused("No task is loaded yet.")
     if not isinstance(load.task, str):
-        # Only the recorded texts of this task were allowed to run, not the file that has its name.
+        # The user allowed the recorded source of this task to run, not the file of the same name.
         why = "This task comes from a recording. To solve seeds, open the task's file."
         return _changed(view, state="failed", why=why), [EndSeeds()] if view.state in RUNNING else []
     begun = SeedsView("starting", view.serial + 1, total=view.chosen, chosen=view.chosen)

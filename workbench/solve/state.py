@@ -70,7 +70,8 @@ class SolveView:
     """(T,) For each step of the episode: mean reward per step over the horizon that begins there, as the best rollout
     predicted it; NaN where nothing was planned."""
     achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) The same mean, as it was achieved; over the steps so far if the horizon is not over; NaN for steps to come."""
+    """(T,) For each step: achieved mean reward per step over the same horizon, or over the part of it that
+    has passed; NaN for steps to come."""
     begins: int = 0
     """Control step of the episode at which `predicted` and `achieved` begin."""
     solved_at: int = 0
@@ -286,8 +287,8 @@ def _changed(solving: Solving, **values: Any) -> Solving:
 class PlanJobs:
     """Performs the effects: one plan at a time. Used on the loop, except `close`.
 
-    A separate process has loaded the same version of the task, and runs the rollouts in envs of its own. It
-    is started with the first plan and ends some time after the last.
+    A separate process loads the same version of the task and runs the rollouts on its own envs. The process
+    is started with the first plan and ends some time after the last one.
     """
 
     def __init__(self, happen: Callable[[SolverEvent], object]) -> None:

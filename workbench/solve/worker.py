@@ -56,7 +56,7 @@ class FollowedPlan:
         self._told = False
         """Whether a request for a plan was sent to the server and has not been dropped since."""
         self._at = -1
-        """`Stepped.number` of the moment for which the first of `_actions` is."""
+        """`Stepped.number` of the moment at which the first of `_actions` is due."""
         self._actions: deque[NDArray[np.float32]] = deque()
         self._env_idx: tuple[int, ...] = ()
 
@@ -100,15 +100,15 @@ class FollowedPlan:
         self._asked = None
         self._actions.clear()
         if self._told:
-            # Tell the server: it may get the request for a plan after it has sent the pause, and would plan
-            # in vain.
+            # Tell the server: the request for a plan may reach it after it has sent the pause, and it would
+            # plan in vain.
             self._told = False
             self._send(PlanDropped())
 
 
 def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[int]:
-    """Envs to plan for: the selected one, or with `solve_all` those that have not succeeded (all if every one
-    has)."""
+    """The selected env; with `solve_all`, the envs that have not succeeded, or all envs if each has
+    succeeded."""
     if not settings.solve_all:
         return [min(settings.selected_env, task.num_envs - 1)]
     done = succeeded(last)
@@ -152,8 +152,8 @@ class WorkerPlans:
         self._planner: RolloutPlanner | None = None
         self._options = PlanOptions()
         self._next: dict[int, tuple[int, int]] = {}
-        """By env that has a plan: seed of its episode, and control step of the episode at which the next plan
-        is due."""
+        """Seed of the episode, and the episode's control step at which the next plan is due, for each env
+        that has a plan."""
 
     def answer(
         self,

@@ -33,7 +33,8 @@ class Shape:
     file: str
     """File of a mesh; empty for other shapes."""
     numbers: tuple[float, ...]
-    """Sizes in metres and pose in the body; then the colour, or friction and density."""
+    """Sizes in metres and pose in the body; then the colour of a visual shape, or friction and density of a
+    collision shape."""
 
 
 @dataclass(frozen=True)

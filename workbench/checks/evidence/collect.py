@@ -277,8 +277,8 @@ class Checkup:
         try:
             return self._made(self.num_envs, False, "warn", {})
         except TaskError as error:
-            # A missing renderer raises errors of many kinds: only another try, with a renderer, shows whether
-            # that was the cause.
+            # A missing renderer raises errors of many kinds: only a second try, with a renderer, shows
+            # whether the task needs one.
             if isinstance(error.__cause__, (MissingAssets, ImportError)):
                 raise
             if not self._may_render:
@@ -414,7 +414,7 @@ class Checkup:
 
     @evidence
     def random(self) -> Episodes:
-        """Episodes of all seeds with random actions, to their end or `ROLLOUT_STEPS`."""
+        """Episodes of all seeds with random actions, up to the time limit but at most `ROLLOUT_STEPS`."""
         rng = np.random.default_rng(0)
         steps = min(self.loaded.max_episode_steps or ROLLOUT_STEPS, ROLLOUT_STEPS)
         actor = _FromSeeds(
@@ -513,7 +513,7 @@ class Checkup:
         return placed
 
     def first_substep(self, task: TaskEnv) -> None:
-        """Make one substep of physics, which finds the contacts of the state before it."""
+        """Make one substep of physics. Its contacts are those of the state before the substep."""
         with blamed("step", self.loaded, task):
             task.env.scene.step()
             fetch(task.env)
@@ -554,7 +554,7 @@ class Checkup:
 
 @dataclass(frozen=True)
 class _FromSeeds:
-    """Actor in an episode of each seed, with the same kind of actions in all envs."""
+    """Actor that runs an episode of each seed, with the same kind of actions in all envs."""
 
     checkup: Checkup
     kind: str

@@ -33,12 +33,12 @@ HEIGHT_METRES = 0.3
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
 """Descriptions of the states of each batch, for a sentence."""
 MAX_GOALS = 4
-"""Maximum number of goal marks at which bodies are placed: a drawing has hundreds of marks."""
+"""Maximum number of goal marks at which bodies are placed: a drawing task has hundreds of marks."""
 AT_GOAL = "with bodies at the place of {}"
 SHORT = "between the reset and a success"
 HALVINGS = 6
-"""Number of halvings with which the point where success ends is searched, on the way from a success back to
-the reset. The last states are at most 1/64 of the way from this point."""
+"""Number of bisection steps that search, between a success and the reset, for the point where success ends.
+The last states are at most 1/64 of the way from this point."""
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
 """Hook of each dense reward mode."""
 
@@ -136,7 +136,8 @@ def _tell_success(
     try:
         rows = _rows(hook(obs=obs, action=action, info=told), num_envs)
     except Exception:
-        # No fault of the task: the state has no success, so other conditions of a success may not hold.
+        # Not the task's fault: the state is no success, and the hook may rely on other conditions of a
+        # success.
         rows = np.full(num_envs, np.nan)
     seen.told.setdefault(mode, []).append(rows)
 

@@ -38,7 +38,8 @@ def together(seen: Iterable[Seen], worst: bool = False) -> list[Seen]:
     """One row for each name, in the order in which names first occur; rows without a name are left out.
 
     Args:
-        worst: take texts, numbers and place of the row with the largest size, instead of the first row that has texts.
+        worst: take texts, numbers and place from the row with the largest size. By default they come from
+            the first row that has texts.
     """
     found: dict[tuple[str, ...], Seen] = {}
     for row in seen:
@@ -66,6 +67,6 @@ def tried(seen: Iterable[Seen], *names: str) -> int:
 
 
 def first_kind(seen: Iterable[Seen]) -> Seen | None:
-    """The row of the first kind of episodes with a breach, among rows that are named by kinds; None if no kind
-    has a breach."""
+    """The first row with a breach, after `together`; None if there is none. Rows are named by the kind of
+    their episodes."""
     return next((row for row in together(seen) if row.count), None)

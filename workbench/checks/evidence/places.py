@@ -69,7 +69,7 @@ class Module:
 
 
 class Places:
-    """Lines of one version of a task."""
+    """Finds lines in the author's files, for one version of a task."""
 
     def __init__(self, loaded: LoadedTask) -> None:
         self._loaded = loaded
@@ -160,7 +160,7 @@ class Places:
         )
 
     def entry(self, name: str, hook: str = "evaluate") -> Place | None:
-        """The line of a hook that has this entry as a key or a keyword; else its ``def`` line."""
+        """The line, in a hook, that has this entry as a key or a keyword; else the hook's ``def`` line."""
         for module, function in self.functions(hook):
             for node in ast.walk(function):
                 if isinstance(node, ast.Constant) and node.value == name:
@@ -170,13 +170,12 @@ class Places:
         return self.hook(hook)
 
     def body(self, name: str, *hooks: str) -> Place | None:
-        """The line that makes or places a body.
+        """The line that makes or places a body: the first call of a setter, in these hooks, on the attribute
+        that holds the body; else the first line, in any function, that names the body; else the ``def`` line
+        of a hook.
 
         Args:
             name: as in `SceneIndex.names`.
-            hooks: functions that are searched for a line that sets the pose of the attribute that holds the
-                body. If there is no such line, the result is the first line, in any function, that names the
-                body; without such a line, the ``def`` line of a hook.
         """
         owner = name.split("/", 1)[0]
         attributes = set(self._attributes_of(owner))

@@ -33,7 +33,10 @@ class Actor(Protocol):
         ...
 
     def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
-        """Reset all envs to the start of these episodes, one for each env. The last one may occur several times.
+        """Reset each env to the start of its episode.
+
+        Args:
+            episodes: (N,) index of the episode of each env; the last episode may occur several times.
 
         Raises:
             TaskError: the task raised.
@@ -99,7 +102,7 @@ class SeenOutliers:
         """Look at a control step.
 
         Args:
-            over: (N,) whether the episode has ended; outliers after that do not count.
+            over: (N,) whether each env's episode has ended; outliers of an ended episode do not count.
         """
         for sight in self._watch.check(now):
             for env in np.flatnonzero(sight.envs & ~over).tolist():
@@ -132,7 +135,7 @@ def stacked(
     """
     count = len(seeds)
     names = [name for name in states[0].evaluate if all(name in state.evaluate for state in states)]
-    # The reward's terms exist from the first step on.
+    # Entries that the reward adds exist from the first step on, not after the reset.
     late = [name for name in states[-1].evaluate if name not in names]
     leaves = [name for name in obs[0] if all(name in one for one in obs)]
     envs = np.arange(count)

@@ -99,7 +99,8 @@ def _profile_of(checkup: Checkup, clock: _Clock, num_envs: int, steps: int, own:
 
 
 class _Clock:
-    """Adds up the time of wrapped functions, each without the wrapped functions that it calls, and of lines."""
+    """Adds up the times of lines and of wrapped functions. The time of a function excludes the wrapped
+    functions that it calls."""
 
     def __init__(self, files: set[str]) -> None:
         self.hooks: defaultdict[str, float] = defaultdict(float)
@@ -140,7 +141,7 @@ class _Clock:
         return timed
 
     def _switch(self, name: str | None) -> None:
-        """Begin to time a function; None ends the one that runs."""
+        """Begin to time a function; None ends the timing of the current one."""
         now = time.perf_counter()
         if self._running and self._measured and not self._traced:
             self.hooks[self._running[-1]] += now - self._since

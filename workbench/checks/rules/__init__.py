@@ -1,1 +1,1 @@
-"""The rules: a function each, in files by hook."""
+"""The rules: one function for each, in files by hook."""

@@ -69,10 +69,11 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    Two envs are reset four times. The rule renders every sensor camera, also with each object alone. It
-    reports an object that is out of view of all cameras in more than a quarter of the resets. It leaves out
-    scenery, the robot, hidden bodies and bodies with nothing to see, and looks for at most 30 objects. It
-    notes objects that are covered by other things in every picture. It does not look at later steps.
+    Two envs are reset four times. The rule renders every sensor camera, once with the whole scene and once
+    with each object alone. It reports an object that is out of view of all cameras in more than a quarter of
+    the resets. It leaves out scenery, the robot, hidden bodies and bodies without visual shapes, and looks
+    for at most 30 objects. It notes objects that are covered by other things in every picture. It does not
+    look at later steps.
     """
     reports = checkup.look(sensor_reports)
     in_view: dict[str, list[Any]] = {}

@@ -41,8 +41,8 @@ def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:
     makes it: a tensor that is made without a device counts as on the host until it is moved. The finding is
     the author's line in which such a tensor meets a tensor of the env's device. The rule leaves out what a
     GPU accepts: tensors without a dimension, indices from the host, values that are copied into a slice, and
-    poses that ManiSkill moves itself. It accepts tensors of unknown origin (`torch.Tensor([1])`), and does
-    not see branches that do not run.
+    poses that ManiSkill itself copies to the device. It accepts tensors of unknown origin
+    (`torch.Tensor([1])`), and does not see branches that do not run.
     """
     uses: TensorUses = checkup.tensor_uses
     for place, mix in uses.mixes.items():
@@ -158,7 +158,8 @@ def _found_loop(place: Place) -> Found:
 
 
 def _loops_over_envs(function: ast.FunctionDef) -> Iterator[ast.For | ast.comprehension]:
-    """Loops and comprehensions of a function whose iterable names something with an item for each env."""
+    """The loops and comprehensions of a function that go over the envs: their iterable names something with
+    an item for each env."""
     counts = {"env_idx"} | {
         target.id
         for node in ast.walk(function)

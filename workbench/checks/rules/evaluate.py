@@ -22,7 +22,8 @@ from workbench.machine.text import listed, of
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 """Entries of ``evaluate()`` that ManiSkill reads."""
 FLICKER_SHARE = 0.25
-"""Maximum share of the steps at which success becomes true that may be followed by a step without success."""
+"""Maximum number of times that success becomes true for one step only, as a share of all times that it
+becomes true."""
 
 
 def see_success_at_reset(checkup: Checkup) -> Iterator[Seen]:
@@ -41,7 +42,7 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ## Why
     ManiSkill ends an episode when success is true, so a trainer resets the env after one step, again and
     again. The success rate counts these episodes, and a policy that does nothing looks good. With thousands
-    of envs even a few percent of such starts shift the curve.
+    of envs, even a few percent of such starts shift the success rate.
 
     ## Mend
     Place the goal farther away than the threshold reaches, or ask for more in `evaluate`.
@@ -325,8 +326,8 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts, and a row for each entry of ``evaluate()`` that is not finite, about
-    the first kind in which it is not finite."""
+    """A row for each kind of rollouts. Also a row for each entry of ``evaluate()`` that is not finite, for
+    the first kind of rollouts in which this happens."""
     reported: set[str] = set()
     for episodes in checkup.rollouts:
         numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))
@@ -369,5 +370,5 @@ def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
 
 
 def flags(rows: NDArray) -> NDArray[np.bool_]:
-    """(T, K) bools from rows (T, K, ...)."""
+    """(T, K) whether any number of a row (T, K, ...) is true."""
     return np.logical_or.reduce(rows.reshape(*rows.shape[:2], -1).astype(bool), axis=2)

@@ -421,7 +421,8 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     A quaternion whose length is not 1 is no rotation. Matrices made of it are scaled or sheared, and
-    distances between rotations are wrong. PhysX may normalise it or not, so that CPU and GPU may differ.
+    distances between rotations are wrong. PhysX may or may not normalise the quaternion, so CPU and GPU may
+    differ.
 
     ## Mend
     Divide by the length, or make the quaternion from angles.

@@ -30,7 +30,7 @@ SAME_TOLERANCE = 1e-4
 """Maximum difference of two numbers that count as equal: a pose that is set and read again is rounded."""
 RESTORED_TOLERANCE = 1e-3
 """Maximum difference of two numbers that count as equal after a state dict is restored: restoring computes
-link poses from joints. Relative for numbers above 1."""
+link poses from joints."""
 _RESET_HOOKS = ("_initialize_episode", "reset")
 _RESULT_HOOKS = ("evaluate", "_get_obs_extra", "_get_obs_agent", "get_info", "get_obs")
 """Hooks that make the result of a reset."""
@@ -102,9 +102,9 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     The rule resets the first seeds, then resets other seeds, makes three random steps and a partial reset,
     and resets the first seeds again. State, `evaluate()` and observation must agree to 0.0001. Readings of
-    the robot's own sensors are left out: a touch sensor shows the contacts of the last substep. If the hooks
-    of a reset, or the functions that they call, have a call that no reset seeds, the rule reports its line:
-    calls of `np.random` and `random`, and calls of torch in `evaluate` and the observation.
+    the robot's own sensors are left out: a touch sensor shows the contacts of the last substep. If a hook of
+    a reset, or a function that it calls, draws random numbers that no reset seeds, the rule reports the line
+    of that call: a call of `np.random` or `random`, or a call of torch in `evaluate` or the observation.
     """
     checkup.require_task()
     task, seeds = checkup.task, next(checkup.batches())
@@ -261,8 +261,8 @@ def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     A demonstration that was recorded with one env shows other objects when it is replayed among many.
 
     ## Why
-    A demonstration is recorded with one env and replayed, or rendered again, among many. If the objects of a
-    seed depend on the number of envs, the replay shows a hand that grasps where nothing is.
+    A demonstration is recorded with one env and replayed, or rendered again, with many envs. If the objects
+    of a seed depend on the number of envs, the replay shows a hand that grasps where nothing is.
 
     ## Mend
     Draw what is built from the generator of each env.
@@ -278,8 +278,8 @@ def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     The rule builds one env alone for the two seeds of the first two envs of the batch, and compares the
     bodies of both builds: kinds, sizes, poses in the body, colours, frictions and mesh files. It does not
-    compare where a reset places bodies, since ManiSkill seeds the whole batch with the seed of its first env
-    there. The result is *not known* with one env.
+    compare where a reset places bodies, since ManiSkill seeds the reset of the whole batch with the seed of
+    its first env. The result is *not known* with one env.
     """
     checkup.require_several()
     assert checkup.task
@@ -346,7 +346,11 @@ def _episode(checkup: Checkup, task: TaskEnv, seeds: list[int]) -> list[Numbers]
 
 
 def _differing(one: Numbers, other: Numbers, tolerance: float) -> dict[str, float]:
-    """By name, the arrays that differ, each with its largest difference; infinite if the shapes differ."""
+    """Largest difference of each array that differs, by name; infinite if the shapes differ.
+
+    Args:
+        tolerance: maximum difference of equal numbers; relative for numbers above 1.
+    """
     found: dict[str, float] = {}
     for name in one.keys() & other.keys():
         a, b = one[name], other[name]

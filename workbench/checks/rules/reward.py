@@ -246,7 +246,8 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] | None:
-    """Slope and offset of the line from the dense to the normalized reward; None if it is no rising line."""
+    """Slope and offset of the normalized reward as a linear function of the dense reward; None if the
+    normalized reward is not linear, or does not rise."""
     if np.ptp(dense) == 0:
         return None
     slope, offset = (float(number) for number in np.polyfit(dense, normalized, 1))
@@ -431,12 +432,12 @@ class _Scored:
     places: list[list[str]]
     """(1, K) or (T, K) description of each state, for a sentence."""
     of: str
-    """The kind of episodes, or which odd states."""
+    """Kind of the episodes, or text such as ``odd states from seed 0``."""
     short: NDArray[np.bool_] | None = None
     """(T,) whether each odd state was made between the reset and a success (`SHORT`); None for rollouts."""
 
     def tried(self, column: int) -> bool:
-        """Whether an episode has a success, and states near it without success."""
+        """Whether an episode has states with success and, near them, states without success."""
         success = self.success[:, column]
         near = success if self.short is None else success[self.short]
         return bool(success.any()) and not bool(near.all())

@@ -236,9 +236,9 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ## How it is checked
     The rule compares the poses of all seeds after their reset and of random episodes. It reports a kinematic
     body that the author's files build and that has one pose in all of them. The result is *not known* if a
-    function sets a pose, except `_load_agent`, `_load_scene`, `_initialize_episode`, `set_state` and
-    `set_state_dict`: it might do so in an episode that was not seen. It is also *not known* with one seed.
-    Hidden bodies are left out.
+    function other than `_load_agent`, `_load_scene`, `_initialize_episode`, `set_state` and `set_state_dict`
+    sets a pose: it might move the body in an episode that was not seen. The result is also *not known* with
+    one seed. Hidden bodies are left out.
     """
     if not any(row.names for row in rows):
         raise NotApplicable("the author's files build no visible kinematic body")
@@ -474,8 +474,8 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
     The state dict has leaves with another batch size: it cannot be saved, sliced or restored.
 
     ## Why
-    Objects that differ from env to env are built one by one and merged. The state dict then still has a leaf
-    of one row for each part, next to leaves of N rows. Such a state cannot be sliced by env, written to a
+    Objects that differ from env to env are built one by one and merged. For each part, the state dict then
+    still has a leaf of one row, next to leaves of N rows. Such a state cannot be sliced by env, written to a
     trajectory file of all envs, or restored in another env. If the merged body is not in the state at all,
     replays do not restore its pose.
 
@@ -595,8 +595,8 @@ def _name_on(env: Any, thing: Any) -> str:
 
 
 def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
-    """The line that puts a body into ``_hidden_objects``: the first line with this name that also names the
-    body, else the first line with this name."""
+    """The line that puts a body into ``_hidden_objects``: the first line that names both, else the first line
+    that names ``_hidden_objects``."""
     name = _name_on(checkup.task.env, thing)
     lines = [
         (name != "" and name in ast.unparse(statement), module.place(statement))

@@ -146,8 +146,8 @@ def reward_against(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
-    reward. The rule reports a task if, in more than half of the solved episodes (three or more), the reward
-    falls on the way by more than a quarter of what it gains from the first step to success.
+    reward. The rule reports a task if at least three episodes are solved and, in more than half of these, the
+    reward falls on the way by more than a quarter of what it gains from the first step to success.
     """
     yield from _verdict(checkup, "reward-against", "compute_dense_reward")
 
@@ -172,8 +172,8 @@ def success_lost(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
-    reward. Each episode goes on for five steps after its first success. The rule reports a task if success is
-    false at one of these steps in more than half of the solved episodes (three or more).
+    reward. Each episode goes on for five steps after its first success. The rule reports a task if at least
+    three episodes are solved and, in more than half of these, success is false at one of the five steps.
     """
     yield from _verdict(checkup, "success-lost", "evaluate")
 
@@ -198,8 +198,9 @@ def failing_pays(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
-    reward. The rule reports a task if more than half of the episodes (three or more) end by `fail` with a
-    mean reward below 0. A rollout earns nothing after its fail, since an episode ends there too.
+    reward. The rule reports a task if there are at least three episodes and more than half of them end by
+    `fail` with a mean reward below 0. A rollout earns nothing after its fail, since an episode ends there
+    too.
     """
     yield from _verdict(checkup, "failing-pays", "compute_dense_reward")
 

@@ -56,8 +56,8 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     ## Why
     `gym.make`, ManiSkill's demos, its recording tools and every trainer make a task by its id. A class
     without an id can be opened here and nowhere else: a job on a cluster that is given the id finds nothing.
-    Gymnasium's own `register` makes an id that only `gym.make` knows, with a time limit for one env. The rule
-    reports such an id too; the workbench uses it and its limit.
+    Gymnasium's own `register` makes an id that only `gym.make` knows, and a time limit that a batch of envs
+    does not get. The rule reports such an id too; the workbench uses the id and its limit.
 
     ## Mend
     Write the decorator above the class.
@@ -301,9 +301,9 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
     The rule reads the source of the hooks and of the functions that they call; nothing runs. It looks up
     attributes that are set on variables made by `create_actor_builder` and `create_articulation_builder`, and
     methods that are called on `self` and `self.scene`. It also accepts an attribute of a builder if the files
-    read an attribute of this name, and a method if the files set its name or contain it as a text, as for
-    `hasattr`. The rule does not look at builders that a function gets as an argument, nor at objects such as
-    `self.agent`.
+    read an attribute of this name, and a method if the files assign an attribute of its name or contain the
+    name as a string, as in a call of `hasattr`. The rule does not look at builders that a function gets as an
+    argument, nor at objects such as `self.agent`.
     """
     checkup.require_source()
     read = {
@@ -510,7 +510,7 @@ def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
 
 
 def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
-    """For each variable of the function that holds a builder: the names of the builder's attributes."""
+    """Names of the builder's attributes, for each local variable that holds a builder."""
     found: dict[str, set[str]] = {}
     for node in ast.walk(function):
         if not isinstance(node, ast.Assign):
