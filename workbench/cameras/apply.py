@@ -98,7 +98,7 @@ def apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
     """
     studio, effects = _apply(studio, event, run, now)
     if studio.is_open and not studio.was_chosen and studio.selected is None and run.task is not None:
-        # Choose a camera once, a sensor if there is one. Afterwards the user may choose none.
+        # Choose a camera once, a sensor if there is one. A later choice of "none" by the user stays.
         cameras = sorted(run.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras:
             studio, _ = _select(studio, cameras[0].key, run)
@@ -220,8 +220,8 @@ def _take_suggestion(studio: Studio, number: int, run: Run, now: Now) -> Change:
 
 
 def _draw_preview(studio: Studio, run: Run) -> Change:
-    """Draw a preview if one is wanted, unless the last preview was drawn at the same step and by the same
-    question."""
+    """Draw a preview if one is wanted, and if the step or the question differs from that of the last
+    preview."""
     key, step = studio.selected, shown_step(run)
     settings = None if key is None else studio.placements.now(key)
     if studio.preview_scale == 1.0 or key is None or settings is None or refusal(run, key):
@@ -265,7 +265,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     if scene_changed:
         studio, stop = outdated(studio), [STOP_REPORTS]
     # Send dropped placements too: one may have been in transit to the worker during the load. Send edited
-    # cameras too: the reload after a revert may create no camera, so the worker's camera would stay where it is.
+    # cameras too: the reload after a revert may keep the worker's cameras, which would stay where they are.
     to_send = dict.fromkeys((*placements.placed, *dropped, *sorted(own & in_file.keys())))
     studio, sent = _send(studio, *to_send)
     studio, planned = plan_in_copy(studio, run)
@@ -294,11 +294,11 @@ def _failed(studio: Studio, lane: Lane, why: str) -> Studio:
 
 
 class StudioJobs:
-    """Runs the jobs of the studio. Used on the loop.
+    """Runs the jobs of the studio. All methods except `close` are called on the loop.
 
-    A temporary camera (`pictures.temporary_camera`) renders the preview, with the lens of the env's camera
-    but at another size: 1280 x 720 takes long without a GPU, and 64 x 64 shows little. Resizing the env's
-    camera instead would change the observation.
+    A temporary camera (`pictures.temporary_camera`) renders the preview: it has the lens of the env's camera,
+    but may be smaller (1280 x 720 takes long without a GPU) or larger (64 x 64 shows little). Resizing the
+    env's camera instead would change the observation.
     """
 
     def __init__(

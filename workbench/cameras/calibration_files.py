@@ -339,7 +339,7 @@ def _workbench_poses(tree: Mapping[Any, Any]) -> Iterator[FoundPose]:
 _ROTATIONS = ("rvec", "rotation_vector", "r", "rotation", "rotation_matrix", "rot", "rot_mat", "rmat")
 _TRANSLATIONS = ("tvec", "translation_vector", "t", "translation", "trans", "position", "tvecs")
 _NO_POSE = ("projection_matrix", "p", "p1", "p2", "q")
-"""Names of 3 x 4 and 4 x 4 matrices in calibration files that are not poses (ROS, OpenCV's stereo calibration)."""
+"""Names of 3 x 4 and 4 x 4 matrices that are not poses, in files of ROS and OpenCV's stereo calibration."""
 
 
 def _search(tree: Any, path: str) -> Iterator[FoundPose]:

@@ -167,8 +167,8 @@ NEW = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-"""Settings of a new camera if the task has no camera of its kind without a mount. They are as in ManiSkill's
-own tasks, but the pose is replaced."""
+"""Settings of a new camera if the task has no fixed camera of the same kind to take them from: as in
+ManiSkill's own tasks. Only the pose is replaced."""
 NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
 PREVIEW_PIXELS = 256
 """Longer side of the new camera's picture."""
@@ -376,8 +376,8 @@ def first_place(
 
 
 def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
-    """Distance in metres along the line of sight to the point nearest to the median of `places` (K, 3); None
-    if there are no places, or if the distance is less than `MIN_TARGET_METRES`."""
+    """Distance in metres from the eye to the point on its line of sight that is nearest to the median of
+    `places` (K, 3). None if there are no places, or if the distance is less than `MIN_TARGET_METRES`."""
     if not len(places):
         return None
     pose = pose_of(settings)

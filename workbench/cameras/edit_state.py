@@ -211,7 +211,7 @@ def _plan_found(studio: Studio, found: PlanFound, run: Run) -> Change:
 
 def _drop(studio: Studio, run: Run) -> Change:
     """Drop the shown plan, and show the newest edit in the file again. If an edit in the file is shown
-    already, forget all edits, which stay in the file."""
+    already, forget all edits; the file keeps them."""
     done = () if studio.edits.shown.stage in IN_FILE else studio.edits.done
     shown = done[-1] if done else EditState()
     studio = with_edits(studio, done=done, shown=shown, copied=None, just_copied="")
@@ -224,8 +224,8 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
     """Compare the running version with the written or reverted edit.
 
     Returns:
-        The studio, and the cameras that the edit changed; no cameras if the running version is not the one
-        after the edit.
+        The studio, and the cameras that the edit changed; no cameras if the running version does not result
+        from the edit.
     """
     request, edit = studio.edits.shown.request, studio.edits.shown.edit
     if request is None or edit is None or not _is_in(studio.edits, task, edit):

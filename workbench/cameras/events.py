@@ -272,7 +272,7 @@ class MeasureLive:
 
     what: str
     question: MeasureCamera
-    """The question without env and poses."""
+    """The question; env and poses are filled in for each case."""
     settings: CameraSettings | None
     """The camera's present settings."""
     cases: tuple[Case, ...]

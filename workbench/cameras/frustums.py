@@ -43,7 +43,7 @@ class PlacedFrustum:
 
 
 class CameraFrustums:
-    """One frustum for each camera with a picture, at the picture's pose."""
+    """One frustum for each camera that has a picture or is being placed."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server

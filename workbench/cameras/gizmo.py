@@ -211,8 +211,7 @@ BAR_PIXELS = 48
 """Height of the folded timeline at the lower edge of the view. The picture's border must stay above the
 timeline."""
 BORDER_METRES = 0.15
-"""Distance of the border from the eye: close to the page's near plane, since otherwise bodies would hide the
-border."""
+"""Distance of the border from the eye: close to the page's near plane, so that no body hides the border."""
 BORDER_COLOUR = (245, 159, 0)
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 

@@ -60,7 +60,7 @@ RPY, WXYZ, AXES = ROTATIONS = get_args(RotationForm)
 FOV, INTRINSIC = LENSES = get_args(LensForm)
 XYZ, ANGLES = get_args(Axis), get_args(Angle)
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
-"""Number of decimals of the shown numbers: metres, radians and directions; degrees; quaternions; pixels."""
+"""Number of decimals shown. `UNIT` is for metres, radians and directions."""
 LENS = "Lens and image"
 ROTATION = "Rotation"
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
@@ -72,11 +72,11 @@ SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 class CameraNumbers:
     """Two folders in the present container: pose (with the rotation, folded), and lens and picture.
 
-    All forms of the pose show the same camera and can change it; one of the three forms of the orientation is shown at a
-    time. With the pose handle, the target moves along with a new position; with the eye and target handles,
-    each of the two changes alone. The numbers of a mounted camera are in the frame of its link. The lens is a
-    field of view or an intrinsic matrix, which exclude each other in ManiSkill's config; changing the form
-    keeps the picture.
+    All forms of the pose show the same camera and can change it; one of the three forms of the orientation is
+    shown at a time. With the pose handle, a new position also moves the target; with the eye and target
+    handles, a new position leaves the target where it is. The numbers of a mounted camera are in the frame of
+    its link. The lens is a field of view or an intrinsic matrix, which exclude each other in ManiSkill's
+    config; changing the form keeps the picture.
 
     Args:
         look_at: returns whether eye and target are placed separately, instead of a pose.
@@ -316,7 +316,7 @@ class CameraNumbers:
 def _with_part(
     numbers: Sequence[float] | Floats, parts: Sequence[str], of: str, to: float
 ) -> tuple[float, ...]:
-    """These numbers with the part `of` replaced; the others stay exactly equal."""
+    """These numbers with the part `of` set to `to`; the others are exactly as before."""
     return tuple(to if part == of else float(n) for part, n in zip(parts, numbers, strict=True))
 
 

@@ -41,15 +41,15 @@ visible (measured: at 1,000 pictures a second, the page shows one every five sec
 SHOWN_WIDTH_PIXELS = 400
 """Width of a shown picture; a panel is some 340 pixels wide."""
 SETTLE_SECONDS = 0.4
-"""Debounce time: if no other picture follows within it, the last one is sent in full size."""
+"""Debounce time: if no other picture follows within it, the last picture is sent in full size."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 
 
 class CameraImage:
-    """A picture of a camera in a container, created with the first picture.
+    """An image in a container that shows a camera's pictures; it is created when the first picture arrives.
 
     Pictures in quick succession are sent at the size at which the panel shows them; the last one is then sent
-    in full size, so that it can be opened large.
+    again in full size, so that it can be opened large.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class CameraImage:
         self._send(kind, smaller)
 
     def settle(self) -> None:
-        """Send the last picture in full size, if no other has followed."""
+        """Send the last picture in full size, if no other has followed within `SETTLE_SECONDS`."""
         if self._whole is not None and self.visible and self._clock() - self._drawn_at >= SETTLE_SECONDS:
             self._send(*self._whole)
             self._whole = None

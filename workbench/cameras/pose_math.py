@@ -192,14 +192,14 @@ def _in_steps(rotation: Floats, step: float) -> Floats:
 
 
 PAUSE_SECONDS = 1.2
-"""Movements by the same control with shorter pauses are one undo step."""
+"""Movements by the same control with pauses of at most this length are one undo step."""
 
 
 class Placing:
     """Places the chosen camera for gizmo, keys, number fields and "move to my view".
 
-    It checks that the camera can be placed, knows the frame of the camera's numbers, and makes one movement
-    one undo step.
+    It checks that the camera can be placed, knows the frame of the camera's numbers, and groups
+    successive moves by one control into one undo step.
     """
 
     def __init__(self, session: LiveSession) -> None:

@@ -15,7 +15,7 @@ from workbench.pictures.camera_report import CameraReport, OfferedPlacement, Sea
 from workbench.task.reference import TaskName
 
 # Each question is small, so that the worker that plays answers it between two steps: sixteen envs take sixteen questions.
-# Only a search takes long: it goes to the background process, and any later request ends it.
+# Only a search takes long: it goes to the background process, and any later request there ends the search.
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class DrawCamera(Question[Picture]):
 
     key: CameraKey
     settings: CameraSettings | None
-    """Settings for this picture only; None for the current ones. Required for a camera that the env does not
-    have; such a camera is drawn without a mount, by a temporary camera (see `scale`)."""
+    """Settings for this picture only; None for the camera's present settings. A camera that the env does not
+    have needs settings; it is drawn without a mount, by a temporary camera (see `scale`)."""
     env: int
     modalities: tuple[str, ...] = ("rgb",)
     """Requested modalities; those that the camera's shader does not provide are left out."""

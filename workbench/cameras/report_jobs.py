@@ -41,7 +41,7 @@ MAX_ENVS = 16
 
 
 class CameraReports:
-    """Asks the questions for reports. Used on the loop."""
+    """Asks the questions for reports. Its methods are called on the loop."""
 
     def __init__(
         self, asker: QuestionClient, background: Background, happen: Callable[[StudioEvent], object]

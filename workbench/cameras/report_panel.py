@@ -259,7 +259,7 @@ class CameraReportPanel(PagePart[SessionView]):
 MIN_HIDDEN_SHARE = 0.1
 """An object is reported as hidden if more than this share of it is hidden."""
 SMALL_PIXELS = 30.0
-"""Number of pixels below which an object counts as small."""
+"""Number of pixels below which `env_words` calls an object small."""
 
 
 @dataclass(frozen=True)
@@ -294,10 +294,11 @@ def metres(value: float) -> str:
 
 
 def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]]:
-    """Rows for the objects to see, least visible first, then for those that the task hides. Scenery is left out.
+    """Table rows: the objects to see, least visible first; then the objects that the task hides. No scenery.
 
-    ``bad``: which of ``seen cut hidden`` the author should check. ``moods``: visibility in each picture: ``good``, ``warn``
-    (cut, or much hidden), ``bad`` (not visible), ``none`` (absent).
+    In a row, ``bad`` names the columns (``seen``, ``cut``, ``hidden``) that the author should check.
+    ``moods`` has the visibility in each picture: ``good``, ``warn`` (cut, or much hidden), ``bad`` (not
+    visible) or ``none`` (absent).
 
     Args:
         unit: what the report counts: ``envs`` or ``steps``.

@@ -51,7 +51,8 @@ def outdated(studio: Studio) -> Studio:
 
 def apply_to_reports(studio: Studio, event: object, run: Run) -> Change:
     """The studio after an event about reports. The worker that plays measures the shown moment and earlier
-    steps, one env at a time, so that it continues playing. The background process measures fresh episodes."""
+    steps, one env at a time, and continues playing in between. The background process measures fresh
+    episodes."""
     match event:
         case MeasureWanted():
             return _measure(replace(studio, problem=""), event, run)

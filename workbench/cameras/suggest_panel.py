@@ -47,7 +47,7 @@ FIRST_ROBOT_LINKS = 4
 on demand."""
 PICTURE_PIXELS = 160
 MIN_PERFECT_SCORE = 0.995
-"""Scores of at least this are shown as 1.00."""
+"""Scores of at least this are shown as 1.00. If all offers have such a score, a note says how to choose."""
 BOX_COLOUR = (230, 73, 128)
 
 RESETS_HINT = (
@@ -90,7 +90,7 @@ class CameraSuggest(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
         self._session = session
         self._wanted: dict[CameraKey, frozenset[str]] = {}
-        """Names of the objects that a camera must see, for each camera for which the user chose objects."""
+        """Names of the objects that a camera must see, if the user chose objects for this camera."""
         self._boxes: dict[CameraKey, Box] = {}
         """Search box of each camera whose box the user edited."""
         self._all_links, self._draws_box, self._resets = False, False, 8

@@ -92,11 +92,12 @@ class WorkerCameras:
     scene, `settle` finishes the current picture and places the waiting cameras.
 
     A picture takes 25 to 90 ms on a software renderer; drawn synchronously between two steps it would halve the step rate.
-    So a picture is started, steps continue, and the picture is fetched when it should be ready, a time that
-    is estimated from the last pictures (see `begin_pictures`). Sensors and human cameras see different
-    objects and so cannot be drawn at once: the sensors come first, and the pictures of each kind are sent as
-    soon as they are ready. At most 15 rounds a second, each with a proportional pause, leave CPU time for a
-    browser on the same machine. A camera that is being dragged is drawn next, alone and without a pause.
+    So a picture is started (see `begin_pictures`), steps continue, and the picture is fetched when it should
+    be ready, as estimated from the last pictures. Sensors and human cameras see different objects and so
+    cannot be drawn together: the sensors come first, and the pictures of each kind are sent as soon as they
+    are ready. A round draws all watched cameras once. To leave CPU time for a browser on the same machine,
+    there are at most 15 rounds a second, each followed by a pause in proportion to its length. A camera that
+    is being dragged is drawn next, alone and without a pause.
     """
 
     def __init__(self, task: GuardedTask, on_first: Callable[[bool], None]) -> None:
@@ -114,7 +115,7 @@ class WorkerCameras:
         self._hurried: set[CameraKey] = set()
         """Watched cameras that were just placed: the next round draws only these, without a pause."""
         self._left: list[tuple[CameraRequest, ...]] = []
-        """Groups of this round that are not started yet, one per kind."""
+        """Groups of cameras, one per kind, that this round has not begun to draw."""
         self._begun: _Begun | None = None
         self._expected: dict[tuple[CameraRequest, ...], float] = {}
         """Expected render time of pictures, in seconds."""
@@ -191,8 +192,8 @@ class WorkerCameras:
         """
         self.settle()  # the same scene is about to be drawn
         with blamed("restore", opened.loaded, opened.env):
-            # Restore all envs: only then are the task's batch-wide state and the process's random generators
-            # restored too. No step follows, so the physics needs no fresh scene.
+            # Restore all envs: restoring a few would leave out the task's batch-wide state and the process's
+            # random generators. No step follows, so the physics needs no fresh scene.
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
@@ -235,7 +236,7 @@ class WorkerCameras:
         self.place_waiting()
 
     def finish_picture(self) -> None:
-        """Finish the current picture and discard it, to be drawn again; call it before the envs move."""
+        """Finish and discard the current picture; it is drawn again later. Call this before the envs move."""
         begun, self._begun = self._begun, None
         if begun is not None:
             self._left, self._wanted = [], bool(self._there)
@@ -259,7 +260,7 @@ class WorkerCameras:
 
     @property
     def placed(self) -> dict[CameraKey, CameraSettings]:
-        """The cameras placed by hand, with the settings with which they are drawn."""
+        """Settings of each camera that was placed by hand."""
         return self._placed.all
 
     def forget_placed(self) -> None:
@@ -338,8 +339,8 @@ class WorkerCameras:
         return "fast" if self._has_fast(env.env.scene) else "exact"
 
     def _has_fast(self, scene: Any) -> bool:
-        """Whether fast pictures can be drawn now; for a new scene, starts to make the missing simplified
-        meshes."""
+        """Whether fast pictures can be drawn now. If the scene is new, starts to make its missing simplified
+        meshes on a thread."""
         if scene is not self._fast_scene:
             self._fast_scene, meshes = scene, list[Mesh]()
             # A GPU draws exact pictures just as fast.
@@ -563,8 +564,7 @@ def _with_classes_of(
 def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], owner: Any) -> dict[str, Any]:
     """The attributes of `owner` that the new text sets to another value, with the new values.
 
-    The attributes of a live env come from the text that built it, and a camera's pose may depend on an
-    attribute.
+    A live env has the attributes that the old text set, and a camera's pose may depend on one of them.
     """
     old, new = Project(before), Project(after)
     edited = [path for path, text in after.items() if before.get(path) != plain_line_ends(text)]

@@ -22,7 +22,7 @@ Convention = Literal["maniskill", "opencv", "opengl"]
 * ``opencv`` (also ROS's optical frames, COLMAP): x right, y down, z forward;
 * ``opengl`` (also Blender, NeRF): x right, y up, z backward.
 
-All conversions go through one pose: ``[x, y, z, qw, qx, qy, qz]``, camera to world, in the convention
+Every conversion goes through a pose ``[x, y, z, qw, qx, qy, qz]``, camera to world, in the convention
 ``maniskill``.
 """
 Direction = Literal["camera_to_world", "world_to_camera"]
@@ -37,7 +37,8 @@ VERTICAL_SINE = 1e-6
 """A camera counts as looking straight down or up if the sine of the angle between its line of sight and the
 vertical is below this. "Upright" is not defined for such a camera."""
 ROTATION_TOLERANCE = 1e-3
-"""Largest accepted deviation of a matrix from a rotation: calibrations are printed with four digits."""
+"""Largest accepted deviation of a matrix's singular values from 1: calibrations are printed with four
+digits."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +51,16 @@ class LookAt:
     """Any point on the optical axis in front of the eye."""
     roll: float = 0.0
     """Radians about the line of sight; positive turns the camera clockwise as seen from behind it. At roll 0
-    the camera is upright. If it looks straight down, roll 0 means that the top of the picture is towards +x;
-    if straight up, towards -x. An upright camera that looks along +x gets these orientations when it is
-    tilted down or up."""
+    the camera is upright. For a camera that looks straight down, roll 0 means that the top of the picture is
+    towards +x; for one that looks straight up, towards -x (as if an upright camera that looks along +x had
+    been tilted down or up)."""
 
 
 # --- rotations ---------------------------------------------------------------------------------------------------
 
 
 def normalised(quaternion: ArrayLike) -> Floats:
-    """(4,) wxyz of unit length with w >= 0, so that q and -q compare equal.
+    """(4,) wxyz of unit length with w >= 0, so that q and -q give the same numbers.
 
     Raises:
         ValueError: the quaternion is not a rotation (all zero, or not finite).
@@ -124,13 +125,13 @@ def nearest_rotation(matrix: ArrayLike) -> Floats:
 
 
 def axes_of(quaternion: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Forward, left and up of a camera: unit vectors (3,) in the frame of its pose."""
+    """Forward, left and up of a camera: unit vectors (3,), in the frame in which `quaternion` is given."""
     r = rotation_matrix(quaternion)
     return r[:, 0], r[:, 1], r[:, 2]
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> float:
-    """Radians of the rotation between two orientations (4,) wxyz; q and -q are the same orientation."""
+    """Angle in radians between two orientations (4,) wxyz; q and -q are the same orientation."""
     # Computed from the vector part, which keeps its precision for small angles.
     w, *vector = qmult(normalised(a), qconjugate(normalised(b)))
     return 2 * math.atan2(math.hypot(*vector), abs(w))
@@ -139,10 +140,10 @@ def angle_between(a: ArrayLike, b: ArrayLike) -> float:
 def quaternion_from_axes(forward: ArrayLike, up: ArrayLike) -> Floats:
     """(4,) wxyz of the camera that looks along `forward` with its top towards `up`.
 
-    `forward` is kept exactly; only the part of `up` at a right angle to it counts.
+    `forward` is kept exactly; of `up`, only the component perpendicular to `forward` is used.
 
     Raises:
-        ValueError: one of them has no length, or the two are parallel.
+        ValueError: a vector has no length, or the two are parallel.
     """
     ahead = _direction(forward, "forward")
     left = np.cross(_direction(up, "up"), ahead)
@@ -214,14 +215,14 @@ def inverse(pose: ArrayLike) -> Floats:
 
 
 def compose(mount: ArrayLike, local: ArrayLike) -> Floats:
-    """(7,) `local`, a pose (7,) in the frame of a body at `mount` (7,), converted to the env's frame."""
+    """(7,) the pose `local` (7,), converted from the frame of a body at `mount` (7,) to the env's frame."""
     m, p = _vector(mount, 7, "a mount's pose"), _vector(local, 7, "a pose")
     r = rotation_matrix(m[3:])
     return make_pose(m[:3] + r @ p[:3], qmult(normalised(m[3:]), normalised(p[3:])))
 
 
 def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
-    """(7,) `world`, a pose (7,) in the env's frame, converted to the frame of a body at `mount` (7,)."""
+    """(7,) the pose `world` (7,), converted from the env's frame to the frame of a body at `mount` (7,)."""
     return compose(inverse(mount), world)
 
 
@@ -254,7 +255,8 @@ def look_at_of(pose: ArrayLike, distance: float = 1.0) -> LookAt:
 
 
 def upright(forward: ArrayLike) -> Floats:
-    """(3, 3) rotation of the camera that looks along `forward` and is level; see `LookAt.roll` for the vertical."""
+    """(3, 3) rotation of the level camera that looks along `forward`; see `LookAt.roll` for a vertical
+    `forward`."""
     ahead = _direction(forward, "forward")
     flat = math.hypot(ahead[0], ahead[1])
     left = np.array([0.0, 1.0, 0.0]) if flat < VERTICAL_SINE else np.array([-ahead[1], ahead[0], 0.0]) / flat
@@ -335,7 +337,7 @@ def intrinsic_of(settings: CameraSettings) -> Floats:
     """(3, 3) intrinsic matrix in pixels, from the intrinsic or the fov of the settings.
 
     Raises:
-        ValueError: the settings have neither, or one that is not valid.
+        ValueError: the settings have neither an intrinsic nor a fov, or a value that is not valid.
     """
     if settings.intrinsic is not None:
         return checked_intrinsic(settings.intrinsic)
@@ -345,11 +347,11 @@ def intrinsic_of(settings: CameraSettings) -> Floats:
 
 
 def checked_intrinsic(matrix: ArrayLike) -> Floats:
-    """(3, 3) an intrinsic matrix that ManiSkill can render.
+    """(3, 3) `matrix`, if it is an intrinsic matrix that ManiSkill can render.
 
     Raises:
-        ValueError: the matrix is not that of a pinhole camera: another shape or last row, focal lengths that are not
-            positive, or a skew, which ManiSkill silently ignores.
+        ValueError: the matrix is not that of a pinhole camera (wrong shape or last row, focal lengths that
+            are not positive), or it has a skew, which ManiSkill silently ignores.
     """
     k = np.asarray(matrix, np.float64)
     if k.shape != (3, 3) or not np.isfinite(k).all():
@@ -374,7 +376,8 @@ def horizontal_fov(intrinsic: ArrayLike, width: int) -> float:
 
 
 def scaled_intrinsic(intrinsic: ArrayLike, size: Sequence[int], new_size: Sequence[int]) -> Floats:
-    """(3, 3) intrinsic matrix for the same view in a picture of another (width, height); pixels need not stay square."""
+    """(3, 3) intrinsic matrix for the same view in a picture of another size (width, height); pixels need not
+    stay square."""
     _check_size(*size)
     _check_size(*new_size)
     scale = np.diag([new_size[0] / size[0], new_size[1] / size[1], 1.0])

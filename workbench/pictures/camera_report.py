@@ -16,7 +16,7 @@ DEPTH_EDGES_METRES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
 """(41,) edges of depth bins, ten bins per decade. They are the same for every camera, so that histograms can
 be compared; depths outside of the edges count in the first or last bin."""
 LARGE_ENOUGH_PIXELS = 100.0
-"""Number of pixels below which an object counts as small: a cube of ten by ten pixels still shows its
+"""Number of pixels below which `ObjectSeen.marks` are reduced: a cube of ten by ten pixels still shows its
 rotation."""
 
 
@@ -49,7 +49,8 @@ class ObjectSummary:
     """Share of the object that the robot covers, averaged over the envs in which the object would be seen
     without the robot."""
     wholly_hidden: float
-    """Share of the envs with the object in which it is visible only without the robot."""
+    """Of the envs that have the object, the share in which it is not visible but would be without the
+    robot."""
     covered: float
     """Share of the object that things other than the robot cover, averaged over the envs in which the object
     would be in the picture if nothing covered it."""
@@ -170,7 +171,7 @@ class CameraReport:
     milliseconds: float
 
     def env_marks(self, wanted: Collection[str] | None = None) -> NDArray[np.float32]:
-        """(E,) the mark of the worst object in each env; see `ObjectSeen.marks`. NaN without objects.
+        """(E,) mark of the worst object in each env (see `ObjectSeen.marks`); NaN where the env has none.
 
         Args:
             wanted: names of the objects that must be seen; None for all drawn objects except scenery.
@@ -185,7 +186,7 @@ class CameraReport:
         return np.where(np.isinf(worst), np.nan, worst).astype(np.float32)
 
     def worst_first(self, wanted: Collection[str] | None = None) -> tuple[int, ...]:
-        """Indices in `envs`, worst mark first; equal marks in the order of `envs`, NaN last."""
+        """Positions in `envs`, worst mark first; equal marks in the order of `envs`, NaN last."""
         return tuple(
             int(i) for i in np.argsort(np.nan_to_num(self.env_marks(wanted), nan=2.0), kind="stable")
         )
@@ -225,7 +226,8 @@ class SearchSpace:
     best: int = 5
     """Maximum number of placements that are offered."""
     apart: float | None = None
-    """Least distance between two offered eyes, metres; None for a seventh of the box's diagonal."""
+    """Minimum distance in metres between the eyes of two offered placements; None for a seventh of the box's
+    diagonal."""
     seed: int = 0
     mount: str | None = None
     """Name of the body that the camera is mounted on."""
@@ -341,7 +343,7 @@ def _least(values: NDArray[np.float32]) -> float | None:
 
 
 def _rounded(value: float, up: bool) -> float:
-    """Round up or down to two digits."""
+    """Round up or down to two significant digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     digits = (np.ceil if up else np.floor)(np.round(value / step, 6))
     return float(np.round(digits * step, 9))

@@ -42,7 +42,8 @@ from workbench.pictures.visibility import (
 )
 
 WIDE_MARGIN_SHARE = 0.1
-"""Sufficient distance between an object and the border, as a share of the picture's shorter side."""
+"""Distance from an object to the border, as a share of the picture's shorter side, below which the score is
+reduced."""
 FREE_METRES = 0.1
 """Distance that must be free in front of the lens, for the camera's own body."""
 ROBOT_DISTANCE_METRES = 0.2
@@ -54,7 +55,7 @@ SUFFICIENT_SCORE = 0.995
 ROUNDS = 2
 """Number of rounds of samples around the best candidates."""
 MAX_EYE_ATTEMPTS = 50
-"""Maximum number of attempts to sample an eye clear of the robot. After these attempts any eye is used, so
+"""Maximum number of attempts to sample an eye that is clear of the robot. If all fail, any eye is used, so
 that a box within the robot can be searched too."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
@@ -70,8 +71,8 @@ def suggest_cameras(
 ) -> tuple[OfferedPlacement, ...]:
     """Search for placements in envs that are already reset; returns the best first. The envs stay unchanged.
 
-    The returned placements keep a distance from each other, since five neighbours would be no more than one
-    suggestion. Fewer than `SearchSpace.best` are returned if no more are found, or if the search is
+    The returned placements keep a distance from each other, so that they are not variants of a single one.
+    Fewer than `SearchSpace.best` are returned if no more are found, or if the search is
     cancelled. The same seed gives the same result.
 
     Args:
@@ -93,7 +94,7 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
     env.
 
     An env's mark is the lowest mark of its objects (`ObjectSeen.marks`, reduced by up to a fifth for an
-    object near the border). It is reduced further if something is right in front of the lens (`FREE_METRES`).
+    object near the border). The env's mark is reduced if something is closer to the lens than `FREE_METRES`.
     """
     marks = []
     for thing in report.wanted_objects(objects):

@@ -29,20 +29,20 @@ class _PlacedCamera:
     config: Any
     """The task's own config."""
     poses: list[sapien.Pose]
-    """Local pose of the camera's component in each env before the placement. It is stored since the task's
-    code may have moved the components away from the config's pose."""
+    """Local pose of the camera's component in each env before the placement. It is stored because the
+    task's code may have moved the components away from the config's pose."""
     settings: CameraSettings
 
 
 class PlacedCameras:
     """The cameras of one env whose pose, lens, size or shader differ from the task's.
 
-    Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made,
-    so if one of these changes, a new component replaces the old one on the same entity. Bodies and physics
-    are untouched. ManiSkill's objects around the components are updated (config, cached matrices, camera
-    group): observations and ``get_params`` are those of an env that was built with the changed config. Resets
-    and snapshots keep a placement, but a reset that rebuilds the scene does not: call `put_back` after such a
-    reset.
+    Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made:
+    to change them, a new component replaces the old one on the same entity. Bodies and physics are
+    untouched. The ManiSkill objects that hold the components are updated (config, cached matrices, camera
+    group), so observations and ``get_params`` are those of an env that was built with the changed config. A
+    placement survives resets and restored snapshots, except a reset that rebuilds the scene: call `put_back`
+    after such a reset.
     """
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ def _exchanged(config: Any, old: list[Any]) -> list[Any]:
 
 
 def _set_lens(component: Any, config: Any, env_index: int) -> None:
-    """Set the lens like ``ManiSkillScene.add_camera``, on a component that may have had another lens."""
+    """Set the lens as ``ManiSkillScene.add_camera`` does, on a component that may already have a lens."""
     component.near, component.far = _of_env(config.near, env_index), _of_env(config.far, env_index)
     if config.fov is not None:
         component.set_fovy(_of_env(config.fov, env_index), compute_x=True)
@@ -190,8 +190,8 @@ def settings_of(config: Any) -> CameraSettings | None:
     """A ``CameraConfig`` as plain numbers; if poses differ between envs, the pose of the first env.
 
     The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance`
-    is the distance to the target if ``look_at`` made the pose. Returns None if the lens, near or far differs
-    between envs, or if the pose is invalid.
+    is the distance to the target if ``look_at`` made the pose, else None. Returns None if the lens, near or
+    far differs between envs, or if the pose is invalid.
     """
     pose = rows_of_pose(config)[0].astype(np.float64)
     length = float(np.linalg.norm(pose[3:]))

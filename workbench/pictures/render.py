@@ -30,7 +30,7 @@ from workbench.pictures.placed_cameras import rows_of_pose, settings_of
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
 _MAX_INT16_METRES = 32.767
-"""Largest position of the minimal shader, which writes int16 millimetres."""
+"""Largest coordinate that the minimal shader can write, as int16 millimetres."""
 
 KINDS: tuple[CameraKind, ...] = ("sensor", "human")
 Request = tuple[str, CameraKind, Sequence[str]]
@@ -93,10 +93,10 @@ def here_without_ray_tracing() -> str:
 
 
 def segmentation_names(env: Any) -> dict[int, str]:
-    """Body name of every id in a segmentation picture, without 0, the background.
+    """Body name of every id in a segmentation picture, except 0, the background.
 
     Ids count the entities of a sub-scene, so they are the same in all envs that are built from the same parts.
-    Where envs differ, an id that means two bodies is called ``a | b``.
+    If an id stands for different bodies in different envs, its name is ``a | b``.
     """
     index = scene_index(env)
     names: dict[int, list[str]] = {}
@@ -119,12 +119,12 @@ def take_pictures(
     """Render the requested cameras of env `env_index`, in the order of `requests`.
 
     ManiSkill renders all cameras of all envs or none, 50 ms a picture on a software driver. Here only the requested
-    ones are rendered, from the env's own sub-scene, with ManiSkill's shaders and texture transforms.
+    cameras are rendered, from the env's own sub-scene, with ManiSkill's shaders and texture transforms.
 
     Args:
         poses: (B, 7) where to draw the env's bodies, as `read_poses` returns them; None for where they are. Only the
-            drawn bodies move, so a past moment can be rendered without changing the simulation. A camera moves with its
-            mount; colours and lights are the present ones.
+            render bodies are moved, so a past moment can be rendered without changing the simulation. A
+            camera moves with its mount; colours and lights are the present ones.
         degree: None for the degree that the env was made with. Only a batch on the CPU can draw fast
             pictures; all other envs draw exact ones.
 
@@ -163,10 +163,11 @@ def begin_pictures(
 ) -> PendingPictures:
     """Start rendering the requested cameras, and return at once.
 
-    SAPIEN submits a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
-    threads of a software driver, draw while the simulation steps on (measured on two cores with
-    lavapipe: 26 control steps of 16 envs in 151 ms during a picture that takes 51 ms alone). The scene is
-    drawn in its present state; do not close it or render another camera before `finish`.
+    SAPIEN submits a picture to the driver in 0.05 ms, and waits only when the picture is read. Meanwhile a
+    GPU, or the threads of a software driver, draw it, and the simulation can continue. (Measured on two cores
+    with lavapipe: 26 control steps of 16 envs took 151 ms while a picture was drawn; without steps, the
+    picture takes 51 ms.) The scene is drawn in its present state; do not close it or render another camera
+    before `finish`.
 
     Args:
         requests: all of one kind, since sensors and human cameras see different objects.
@@ -233,7 +234,7 @@ def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
-    """Entities of an env that are to be drawn at `poses`; call it before objects are shown or hidden.
+    """Entities of an env, each with its pose in `poses`; call this before objects are shown or hidden.
 
     Args:
         poses: as in `take_pictures`.
@@ -261,7 +262,7 @@ def _varies(config: Any, components: Sequence[Any]) -> bool:
 
 
 def mount_of(env: Any, camera: Any) -> str | None:
-    """Name of the body that a camera is mounted on; `camera` as `cameras_of` gives it."""
+    """Name of the body that a camera is mounted on; `camera` is from `cameras_of`."""
     mount = camera.camera.mount
     return None if mount is None else scene_index(env).name_of(maniskill_private.objects_of(mount)[0])
 
@@ -284,11 +285,11 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Context in which the task's hidden objects are drawn in this env if `shown`, else are not drawn.
 
-    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
-    simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back for
-    pictures of human cameras. If other code has moved an object back meanwhile, sensors see it here too, as
-    the policy does. Visibility and poses are restored afterwards, so a picture does not change the
-    simulation.
+    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by
+    visibility, in GPU simulation by moving the object 99999 m away. Here visibility is used. An object that
+    was moved away is put back for human cameras, and stays where it is for sensors: if other code has moved
+    it back into view, sensors see it here too, as the policy does. Visibility and poses are restored
+    afterwards, so a picture does not change the simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
@@ -353,8 +354,7 @@ def _read(
 
 
 def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
-    """(H, W) metres, 0 for background, from the texture `data`, and from `transformed`, ManiSkill's own
-    reading of the texture.
+    """(H, W) depth in metres, 0 for background; `transformed` is ManiSkill's reading of the texture `data`.
 
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
     in the default and ray tracing shaders, they are used directly. The minimal shader's texture is
@@ -391,10 +391,10 @@ def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
 
 
 def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:
-    """Pictures of the requested cameras, of the last observed state, env by env.
+    """Pictures of the last observed state by the requested cameras, env by env.
 
     A picture takes 25 to 50 ms on a software renderer, so pictures in the observation are reused: they equal
-    rendered pictures (tested), but have depth and segmentation as ManiSkill's int16 millimetres and ids.
+    rendered pictures (tested), except that depth (millimetres) and segmentation are ManiSkill's int16.
     Pictures are rendered only if they are not in the observation, if they have depth beyond 32.767 m, or if
     their shader is more precise than millimetres. Raises as `take_pictures`.
     """

@@ -109,5 +109,5 @@ def _material(material: Material) -> sapien.render.RenderMaterial:
 
 
 def _levels(pixels: NDArray[np.uint8]) -> int:
-    """Number of mipmap levels, down to a few pixels: without them, a distant wooden table is noise."""
+    """Number of mipmap levels, the smallest a few pixels wide: without them, distant wood is noise."""
     return max(1, int(np.log2(min(pixels.shape[:2]))) - 2)

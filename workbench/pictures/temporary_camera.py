@@ -61,18 +61,18 @@ def temporary_camera(
     size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
 ) -> Iterator[TemporaryCamera]:
-    """Context with a camera in one env. Within it, change nothing in the env and take no other picture.
+    """Context with a camera in one env. Until it ends, change nothing in the env and take no other picture.
 
-    The camera is in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in
-    the sub-scene would change the order of entities, on which tables, snapshots and PhysX's packed state
-    rely. It would also use up a segmentation id. (Measured with sapien 3.0.3: entities, packed poses, ids and
-    pictures of the other cameras are equal before and after.)
+    The camera is in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. A camera in
+    the sub-scene itself would change the order of its entities, on which the scene's index, snapshots and
+    PhysX's packed state rely, and would use up a segmentation id. (Measured with sapien 3.0.3: entities,
+    packed poses, ids and pictures of the other cameras are equal before and after.)
 
     Args:
         kind: sensors do not see what the task hides from them.
         settings: the camera's lens; the pose is an argument of `look`.
-        size: width and height of the pictures, which show the view of `settings`; None for the size in
-            `settings`.
+        size: width and height of the pictures; None for the size in `settings`. Another size does not change
+            the view.
         poses: (B, 7) where to draw the env's bodies; None for where they are.
 
     Raises:
@@ -113,7 +113,7 @@ def temporary_camera(
 
 @contextmanager
 def undrawn(entities: Sequence[Any]) -> Iterator[None]:
-    """Context in which these entities are not drawn; None is ignored."""
+    """Context in which these entities are not drawn; items that are None are ignored."""
     bodies = [body for entity in entities if entity is not None for body in entity.components]
     drawn = [body for body in bodies if isinstance(body, sapien.render.RenderBodyComponent)]
     with temporarily((body, "visibility", 0.0) for body in drawn):

@@ -30,7 +30,7 @@ from workbench.pictures.render import cameras_of, mount_of
 from workbench.pictures.temporary_camera import TemporaryCamera, temporary_camera, undrawn
 
 MEASURED_SIDE_PIXELS = 64
-"""Shorter side of the measured pictures, which is enough to compare placements."""
+"""Shorter side of the measured pictures; 64 pixels are enough to compare placements."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Placement:
     settings: CameraSettings
     kind: CameraKind = "sensor"
     mount: str | None = None
-    """Name of the body whose frame `settings` are in; None for the env's."""
+    """Name of the body in whose frame the pose in `settings` is given; None for the env's frame."""
     name: str = "suggested"
 
 
@@ -89,7 +89,7 @@ def list_objects(env: Any) -> tuple[SceneObject, ...]:
 
 
 def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
-    """The objects that a search can name, as plain data."""
+    """The task's objects without scenery, then its robots, as plain data."""
     names, objects = scene_index(env).names, list_objects(env)
     seen = tuple(
         ObjectToSee(
@@ -105,11 +105,12 @@ def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
 
 
 def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
-    """Names of a robot's drawn links: its hand, then the others by their distance from the tool centre point.
+    """Names of a robot's drawn links: its hand, then the others by increasing distance from the tool centre
+    point.
 
     In ManiSkill's agents with a hand, the tool centre point is the link ``tcp``; the hand is the drawn link
-    that carries ``tcp``, even if the fingers are nearer to ``tcp``. Without a ``tcp`` the last link comes
-    first.
+    that carries ``tcp``, even if the fingers are nearer to ``tcp``. Without a ``tcp``, the links are in
+    reverse order, the last one first.
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
     drawn = [body for body in reversed(robot.bodies) if is_drawn(entities[body])]
@@ -167,8 +168,7 @@ def measure_placement(
 
     Args:
         poses: (B, 7) where to draw the bodies, as `read_poses` returns them; None for their present poses.
-        size: width and height of the measured pictures, which show the camera's view (see `small_size`); None
-            for the camera's own size.
+        size: width and height of the measured pictures (see `small_size`); None for the camera's own size.
 
     Raises:
         ValueError: the lens is not valid, or there is no such mount.
@@ -189,7 +189,7 @@ def picture_of(
     poses: NDArray[np.float32] | None = None,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """A picture from a camera that need not exist; arguments and errors as `measure_placement`."""
+    """A picture from a camera that need not exist; arguments and errors as for `measure_placement`."""
     pose = placement_pose(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
     with temporary_camera(env, e, placement.kind, placement.settings, size, poses) as view:
         segmentation, depth = view.look(pose)
@@ -198,7 +198,7 @@ def picture_of(
 
 
 def present_settings(camera: Any, env_index: int) -> CameraSettings:
-    """Present settings of one env's camera, the lens as an intrinsic matrix; `camera` as in `cameras_of`."""
+    """Present settings of one env's camera (from `cameras_of`), with the lens as an intrinsic matrix."""
     component = maniskill_private.camera_components(camera)[env_index]
     local = component.local_pose
     qw, qx, qy, qz = map(float, local.q)
@@ -216,7 +216,8 @@ def present_settings(camera: Any, env_index: int) -> CameraSettings:
 
 
 def small_size(width: int, height: int, shorter: int = MEASURED_SIDE_PIXELS) -> tuple[int, int]:
-    """Width and height with about the same aspect ratio, and a shorter side of at most `shorter` pixels."""
+    """Width and height, shrunk so that the shorter side has at most `shorter` pixels; keeps the aspect ratio
+    approximately."""
     scale = min(1.0, shorter / min(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -229,7 +230,7 @@ def placement_pose(
 ) -> NDArray[np.float64]:
     """(7,) pose of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
     if placement.mount is None:
-        # Not normalised: a quaternion that is not of unit length gives another picture.
+        # Not normalised: with a quaternion that is not of unit length, SAPIEN draws a different picture.
         return np.array([*placement.settings.position, *placement.settings.quaternion])
     mount = bodies[mount_column(index, placement.mount)]
     if not np.isfinite(mount).all():
@@ -256,16 +257,15 @@ def measure(
 ) -> CameraReport:
     """Render pictures and count pixels; returns the report of one env.
 
-    Bounding boxes and frustums ignore occlusion, so pictures are rendered. The segmentation gives each
-    pixel's object; a second picture without the robot shows what the robot covers; a picture of each object
-    alone shows what the border cuts and what other things cover. The robot's meshes are nearly all of a
-    picture's cost (30 ms with a Panda on a software driver, 2 ms without), so the other pictures, which are
-    without the robot, are almost free. An object that the task hides from sensors counts as never drawn for a
-    sensor.
+    Bounding boxes and frustums ignore occlusion, so pictures are rendered: one of the whole scene, whose
+    segmentation gives each pixel's object; one without the robot, to find what the robot covers; and one of
+    each object alone, to find what the border cuts and what other things cover. Only the first is slow, since
+    the robot's meshes are nearly all of a picture's cost (30 ms with a Panda on a software driver, 2 ms
+    without). An object that the task hides from sensors counts as never drawn for a sensor.
 
     Args:
         settings: settings of the camera; pixel counts are scaled to its size, since `view` may be smaller.
-        bare: the report from this pose without the robot, if there is one: then one picture is enough.
+        bare: the report from this pose without the robot; if it is given, only the whole scene is rendered.
     """
     began = time.perf_counter()
     shown = [thing for thing in objects if not (thing.robot or thing.name == "ground")]
@@ -273,7 +273,7 @@ def measure(
     segmentation, depth = view.look(pose)
     height, width = segmentation.shape
     scale = np.float32(settings.width * settings.height / (width * height))
-    # Comparing with few numbers is ten times faster than np.isin, and this is done for hundreds of pictures.
+    # For a few ids, `_mask` is ten times faster than np.isin; a search measures hundreds of pictures.
     here = set(np.unique(segmentation).tolist())
     pixels = [_one(_mask(segmentation, here & own).sum()) * scale for own in ids]
     robot = [entity for thing in objects if thing.robot for entity in entities_of(thing, e, index)]
@@ -326,7 +326,8 @@ def measure(
 def _depths(
     depth: NDArray[np.float32], something: NDArray[np.bool_], counts: NDArray[np.bool_]
 ) -> DepthReport:
-    """Depth report of one picture (H, W), from masks `something` (no background) and `counts` (robot or object)."""
+    """Depth report of one picture (H, W). Two masks: `something` is all but the background; `counts` is robot
+    and objects."""
     far, of_objects = depth[something], depth[counts]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
     histogram, _ = np.histogram(

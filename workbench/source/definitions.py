@@ -37,9 +37,9 @@ class Binding:
 class Project:
     """The author's files, parsed on demand.
 
-    Which branches run depends on the task, so a definition in a branch may or may not hold. Readers are
-    over-counted rather than missed: every file that contains the name counts. If a reader is counted wrongly,
-    the only effect is that a new value is written where it is used, not where it is defined.
+    Which branches run depends on the task, so a definition in a branch may or may not apply. Searches for
+    other readers of a value find too many rather than too few: they cover every file that contains the name.
+    A wrongly found reader only means that a new value is written where it is used, not where it is defined.
     """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
@@ -49,7 +49,7 @@ class Project:
         self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
 
     def file(self, path: str) -> SourceFile:
-        # Cached here too: nodes are compared by identity, and `parse_file` caches only the last files.
+        # Cached here too: nodes are compared by identity, and `parse_file` caches only a few files.
         if path not in self._files:
             self._files[path] = parse_file(path, self.texts[path])
         return self._files[path]
@@ -100,12 +100,13 @@ class Project:
         read: ast.AST,
         concerns: Callable[[str, str], bool] = lambda path, owner: True,
     ) -> str | None:
-        """The place, as text, of a reader of the binding other than the node `read` of the file `reader`;
-        None if there is none.
+        """The place, as text, of another reader of the binding; None if there is none.
 
         Args:
-            concerns: returns whether an object of a class (file and name) may have the binding as an
-                attribute. On objects other than ``self``, every attribute with the name counts.
+            reader, read: file and node of the known reader.
+            concerns: returns whether objects of a class (file and name) may have the binding as an attribute.
+                It is asked about attributes of ``self``; on any other object, every attribute with the name
+                counts.
         """
         home, name = binding.file, binding.name
         scope = home.scopes(binding.node)[0]
@@ -145,7 +146,8 @@ class Project:
 
 
 def class_of_self(file: SourceFile, node: ast.AST) -> str | None:
-    """The name of the class in whose method `node` is an attribute of ``self``; None for any other node."""
+    """Qualified name of the class whose method contains `node`, if `node` is an attribute of ``self``; else
+    None."""
     if not isinstance(node, ast.Attribute) or not isinstance(node.value, ast.Name):
         return None
     scopes = file.scopes(node)
@@ -298,7 +300,7 @@ def _exclusive(file: SourceFile, a: ast.AST, b: ast.AST) -> bool:
 
 
 def _other_element(file: SourceFile, node: ast.AST, mine: ast.AST) -> bool:
-    """Whether `node` and `mine` read different elements, as the two names in ``CAMERA["fov"]`` and
+    """Whether the names `node` and `mine` have different constant subscripts: ``CAMERA["fov"]`` and
     ``CAMERA["eye"]``."""
     keys = []
     for name in (node, mine):

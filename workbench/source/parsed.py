@@ -19,7 +19,7 @@ from workbench.machine.parse_python import parse_python
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Scope = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 Span = tuple[int, int]
-"""Offsets of the first character and of the end."""
+"""Offset of the first character, and offset after the last."""
 LOOPS = (ast.For, ast.AsyncFor, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 _LINE_END = re.compile(r"\r\n?|\n")
@@ -35,7 +35,7 @@ _BLANK = {
 
 
 class RefusedEdit(Exception):
-    """An edit cannot be made; raised from anywhere while it is planned."""
+    """An edit cannot be made; any code that plans it may raise this."""
 
     def __init__(self, reason: str, snippet: str = "") -> None:
         super().__init__(reason)
@@ -82,7 +82,7 @@ class SourceFile:
         )
 
     def _offset(self, line: int, column: int) -> int:
-        """Offset in the text of a column that is counted in bytes of UTF-8, as in Python's nodes."""
+        """Offset in the text of a line and a column; the column counts UTF-8 bytes, as in Python's nodes."""
         start = self._starts[line - 1]
         if self.text.isascii():
             return start + column
@@ -103,7 +103,7 @@ class SourceFile:
             start, end = opens, closes
 
     def _room(self, node: ast.AST) -> Span:
-        """The span in which parentheses around a node belong to the node, and not to a call around it."""
+        """The span within which parentheses around a node are its own, not those of an enclosing call."""
         outer = self.parents.get(node)
         if isinstance(outer, ast.keyword):
             node, outer = outer, self.parents[outer]
@@ -121,7 +121,7 @@ class SourceFile:
         ]
 
     def token_after(self, start: int, string: str) -> int:
-        """Offset of the first token `string` from `start` on."""
+        """Offset of the first token `string` at or after the offset `start`."""
         following = self._tokens[bisect_left(self._tokens, (start,)) :]
         return next(begin for begin, _, token in following if token == string)
 
@@ -174,7 +174,7 @@ class SourceFile:
         return self._expressions[span]
 
     def at(self, line: int, end_line: int, column: int, end_column: int) -> ast.expr | None:
-        """The expression at a position of a code object (``co_positions``)."""
+        """The expression at a position from ``co_positions`` of a code object; None if there is none."""
         if not 0 < line <= end_line <= len(self._starts):
             return None
         return self._expressions.get((self._offset(line, column), self._offset(end_line, end_column)))
@@ -250,7 +250,7 @@ class SourceFile:
     # --- edits --------------------------------------------------------------------------------------
 
     def replaced(self, replacements: Sequence[Replacement]) -> str:
-        """The text with `replacements`, which must not overlap."""
+        """The text after these replacements, which must not overlap."""
         newline = next((m[0] for m in _LINE_END.finditer(self.text)), "\n")
         parts: list[str] = []
         at = 0
@@ -283,8 +283,12 @@ class SourceFile:
         return [Replacement(end, end, "".join(f", {text}" for text in texts))]
 
     def added_item(self, node: ast.AST, indent: str, text: Callable[[str], str]) -> list[Replacement]:
-        """Add an item between the brackets, on its own lines. `indent` is the statement's indentation; `text`
-        returns the item's code for the indentation of the item."""
+        """Add an item between the brackets, on its own lines.
+
+        Args:
+            indent: indentation of the statement.
+            text: returns the item's code, given the indentation of the item.
+        """
         start, close = self.content_span(node)
         items = self.items(node)
         own = indent + "    "
@@ -340,7 +344,8 @@ def plain_line_ends(text: str) -> str:
 
 
 def arguments(call: ast.Call, parameters: Sequence[str]) -> dict[str, ast.expr]:
-    """The arguments of a call by parameter, without those of ``*`` and ``**``."""
+    """The arguments of a call by parameter. ``**``, and positional arguments from the first ``*`` on, are
+    left out."""
     first = next((i for i, arg in enumerate(call.args) if isinstance(arg, ast.Starred)), len(call.args))
     given = dict(zip(parameters, call.args[:first], strict=False))
     return given | {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg is not None}
@@ -395,7 +400,7 @@ class Read:
 
 if TYPE_CHECKING:
     Plain = float | str | None | tuple["Plain", ...]
-else:  # the decoder of messages has no recursive types: numbers, vectors, matrices and lists of these
+else:  # the message decoder supports no recursive types; four levels of nesting are enough
     _One = float | str | None
     Plain = _One | tuple[_One | tuple[_One | tuple[_One | tuple[_One, ...], ...], ...], ...]
 

@@ -69,7 +69,7 @@ def trace_call(
 
     Args:
         parameters: parameters of the called function, in order.
-        values: the values of the requested parameters.
+        values: run-time value of each parameter to trace.
 
     Returns:
         None if the call is not in one of the project's files.
@@ -115,9 +115,9 @@ class ValueReader:
     """Follows the arguments of one call while its frame exists.
 
     The frame has the value of every name, and the frame's code has the exact position of the call. A name is
-    followed to its assignment. If several assignments may hold, it is followed to the one whose value equals
-    the running value. Any doubt raises `Unknown`, because the result decides which line of the author's file
-    is edited.
+    followed to its assignment. If several assignments may apply, the name is followed to the one whose value
+    equals the name's present value. Any doubt raises `Unknown`, because the result decides which line of the
+    author's file is edited.
     """
 
     def __init__(self, project: Project, file: SourceFile, call: ast.expr, frame: FrameType) -> None:
@@ -203,7 +203,7 @@ class ValueReader:
         return self._evaluate(file, node, node, bool)
 
     def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: TracedValue) -> TracedValue:
-        """`whole`; if a number within it can be edited instead, with this number as its part ``of``.
+        """`whole`. If a number within the expression can be edited instead, it is added as the part ``of``.
 
         Examples: the 60 of ``60 * np.pi / 180``; the 0.2 of ``HEIGHT + 0.2``, so that the value still follows
         HEIGHT.
@@ -312,8 +312,8 @@ class ValueReader:
         return self._project.file(path) if path in self._project.texts else None
 
     def _follow(self, file: SourceFile, node: ast.expr) -> tuple[SourceFile, ast.expr, str | None]:
-        """The file and the expression that define a name, and the place of another reader (None if there is
-        none). Raises Unknown."""
+        """The file and the expression that define a name, and a place where other code reads the name (None
+        if there is none). Raises Unknown."""
         project = self._project
         if isinstance(node, ast.Subscript):
             return self._element(file, node)
@@ -356,7 +356,7 @@ class ValueReader:
         return binding.file, binding.value, others
 
     def _binding_of_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
-        """The binding whose value equals the running value. Raises Unknown unless there is exactly one."""
+        """The binding whose value is the name's present value. Raises Unknown unless there is exactly one."""
         fitting = []
         for binding in bindings:
             try:
@@ -438,8 +438,8 @@ def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
         return lambda path, owner: True
 
     def concerns(path: str, owner: str) -> bool:
-        # Objects of `home` and of its subclasses have the attribute, also in methods that they inherit from
-        # `owner`.
+        # In a method of `owner`, ``self`` may be an object of `home` or of a subclass only if that class is,
+        # or inherits from, `owner`.
         return any((path, owner) in classes_of(cls) for cls in (home, *_subclasses(home)))
 
     return concerns
@@ -481,7 +481,7 @@ def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:
 
 
 def _is_named(node: ast.AST) -> bool:
-    """Whether `node` is a name or attribute, which can be evaluated again without effect."""
+    """Whether `node` is a name or attribute, which can be evaluated again without side effects."""
     return all(isinstance(inner, (ast.Name, ast.Attribute, ast.Load)) for inner in ast.walk(node))
 
 
@@ -543,7 +543,8 @@ class KnownFunction:
 @cache
 def known_functions() -> dict[Callable[..., Any], KnownFunction]:
     """Known functions by identity, so that a file may import them under any name."""
-    maniskill_private.mark_camera_configs()  # wraps look_at; the original may have been imported before: both are known
+    # This wraps look_at. A file may have imported the original before, so both are in the table.
+    maniskill_private.mark_camera_configs()
     converts, number, look_at = (
         KnownFunction(converts=True),
         KnownFunction(),

@@ -58,8 +58,8 @@ class CameraEdit(Changes):
 
         Args:
             first: the file to name first if several files change.
-            key: the camera to change; None if one is added.
-            expected: key of the resulting camera; None if it is removed.
+            key: the camera to change; None if the edit adds a camera.
+            expected: key of the resulting camera; None if the edit removes the camera.
 
         Raises:
             RefusedEdit: no text changes, the camera's mount would change, or another camera would change,
@@ -104,8 +104,8 @@ def planning(
     settings: CameraSettings | None = None,
     more: Sequence[str] = (),
 ) -> Iterator[CameraEdit]:
-    """Context with a `CameraEdit`. If a RefusedEdit is raised in it, the exception gets text to copy: the
-    camera with `settings`."""
+    """Context with a `CameraEdit`. A RefusedEdit that is raised in the context gets a snippet for the author
+    to copy: a camera with `settings`."""
     try:
         yield CameraEdit(sources, run)
     except RefusedEdit as refused:

@@ -1,4 +1,4 @@
-"""A camera as Python text, and edits that add this text to a camera hook, or add a hook with it."""
+"""Writes a camera as Python text, and adds this text to an existing or a new camera hook."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def returned_expression(file: SourceFile, function: Function) -> ast.expr:
 def append_camera(
     file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], str]
 ) -> list[Replacement]:
-    """Add the camera `text(indent)` to `value`, the expression with the cameras of a hook. Raises RefusedEdit
-    if `value` is neither a config nor a list, tuple or dict."""
+    """Add the camera `text(indent)` to `value`, the expression that a hook returns. Raises RefusedEdit if
+    `value` is neither a config nor a list, tuple or dict."""
     start, end = file.inner_span(value)
     indent = file.indent(start)
     called = file.code(value.func) if isinstance(value, ast.Call) else ""
@@ -87,8 +87,8 @@ def new_hook(
     hook: str,
     text: Callable[[str], str],
 ) -> Replacement:
-    """Add the hook, which returns the camera `text(indent)`. Raises RefusedEdit if the class inherits the
-    hook."""
+    """Add `hook` to the class; the hook returns the camera `text(indent)`. Raises RefusedEdit if the class
+    inherits this hook."""
     owner, where = hook_cameras.owners.get(hook, ("", ""))
     if where in project.texts:
         raise RefusedEdit(

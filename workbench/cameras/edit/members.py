@@ -36,14 +36,13 @@ def plan_add(
 ) -> SourceEdit:
     """Add a fixed camera to the camera hook of `class_name`; adds the hook if the class has none.
 
-    A hook returns one config, a list or tuple of configs, or a dict; one config is changed to a list. The
-    pose is written as a ``look_at`` if another camera in the file has a ``look_at`` and a ``look_at`` can
-    express the pose.
+    The hook may return one config (which is then put into a list), a list or tuple of configs, or a dict. The
+    pose is written as a ``look_at`` if this can express the pose and another camera in the file uses one.
 
     Raises:
         RefusedEdit: the hook returns anything else (a name that is not assigned a list or dict, a
-            concatenation, a call of the parent's hook), or has several returns. As in all plans of this
-            module except a removal, the exception has the reason and the text to copy.
+            concatenation, a call of the parent's hook), or has several returns. The exception has the reason
+            and text to copy, as for all plans of this module except `plan_remove`.
     """
     check_camera(settings)
     kind, uid = key
@@ -101,8 +100,8 @@ def plan_duplicate(
 def plan_rename(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: RunHooks
 ) -> SourceEdit:
-    """Rename a camera, with notes that its observations get the new name, and in how many other places of the
-    file the old name occurs. Raises RefusedEdit, with `settings` as text to copy."""
+    """Rename a camera. Notes of the edit warn that the observations get the new name, and count the places of
+    the file that still have the old name. Raises RefusedEdit, with `settings` as text to copy."""
     new_key: CameraKey = (key[0], new_uid)
     with planning(sources, run, new_uid, settings) as edit:
         call = _single_call(edit, key)

@@ -21,11 +21,11 @@ from workbench.task.write_edits import SourceEdit, why_not_writable
 def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, run: RunHooks) -> EditState:
     """Plan the edit of the files on disk for a request, or report why there is none.
 
-    The worker also runs the edited files; a plan whose camera differs from the request is refused. Not thread-safe, and too
-    slow for the page's thread.
+    The worker runs the edited files too, and a plan that gives the camera other settings than requested is
+    refused. Not thread-safe, and too slow for the page's thread.
 
     Args:
-        info: description of the live camera; None if one is added.
+        info: description of the live camera; None for a camera to add.
         run: runs the hooks in the worker.
     """
     placed = None if request.what == "remove" else request.settings
@@ -89,8 +89,8 @@ def _override_edit(
     run: RunHooks,
 ) -> SourceEdit:
     """The edit that adds a hook to the task's own class to replace an inherited camera. If the edit is
-    refused, the snippet of the RefusedEdit is this hook, or only the camera if no hook of a task makes the
-    camera. For a removal there is no snippet."""
+    refused, the text to copy is this hook, or only the camera if a function other than a task's camera hook
+    makes the camera. A refused removal has no text to copy."""
     if request.settings is None or request.what == "remove":
         raise RefusedEdit(owner_text)
     (kind, _), (_, uid), site = request.key, request.result, info.site

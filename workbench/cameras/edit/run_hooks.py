@@ -24,7 +24,7 @@ RecordedCalls = dict[int, tuple[Any, CameraSettings | None, Trace | None]]
 
 @contextmanager
 def recording_calls(sources: Mapping[str, str]) -> Iterator[RecordedCalls]:
-    """Record every camera config that these texts make within the context."""
+    """Record every camera config that is made in the context, with a trace if the call is in these texts."""
     project, recorded = Project(sources), RecordedCalls()
 
     def note(config: Any, frame: FrameType) -> None:
