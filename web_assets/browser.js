@@ -1,9 +1,9 @@
 // Detects browsers without WebGL 2 or without hardware acceleration. Features to request from viser for the latter: no smoothed
-// edges, no copy of each frame, fewer pixels during motion, a cheap material, a setting that turns its notice off.
+// edges, no copy of each frame, fewer pixels during motion, a cheap material, a setting that turns viser's notice off.
 "use strict";
 {
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in viser's BrowserWarning.tsx
-  const [TOLD, NOTICE] = ["wb-told-software", 8000]; // milliseconds
+  const [TOLD, NOTICE] = ["wb-told-software", 8000]; // storage key; milliseconds
   const NO_WEBGL = `<h1>This browser has no WebGL 2</h1>
     <p>Workbench draws its 3-D view with WebGL 2, and shows nothing without it. The workbench itself is running. What to do:</p>
     <ul>
@@ -21,8 +21,8 @@
   }
 
   // viser lowers the resolution of its view when frames are slow. With software rendering the page is blocked for 0.2 to 0.8 s
-  // while it makes the new buffers. viser reads a fixed resolution from the page's address, once, before it makes its canvas;
-  // it is removed from the address afterwards, since users copy addresses.
+  // while viser makes the new buffers. So this sets a fixed resolution in the page's address, which viser reads once, before it
+  // makes its canvas. Afterwards the old address is restored, since users copy addresses.
   function fixResolution() {
     const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
     const address = new URL(location.href);
@@ -42,7 +42,7 @@
   if (!gl) addEventListener("DOMContentLoaded", tellNoWebGL);
   else if (named && SOFTWARE.test(gl.getParameter(named.UNMASKED_RENDERER_WEBGL))) {
     fixResolution();
-    // Elements with data-only report it to the server. viser's notice is shown once, for a while (page.css).
+    // Elements with data-only report software rendering to the server. viser's notice is shown once, for NOTICE (page.css).
     const { dataset } = document.documentElement;
     dataset.drawnInSoftware = localStorage.getItem(TOLD) ?? "";
     localStorage.setItem(TOLD, "told");

@@ -8,7 +8,8 @@ window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-o
   const varint = (n) => { const out = []; for (; n > 127; n = Math.floor(n / 128)) out.push((n % 128) | 128); return [...out, n]; };
   const field = (number, bytes) => [number * 8 + 2, ...varint(bytes.length), ...bytes];
   const text = (string) => [...new TextEncoder().encode(string)];
-  // ViewerControlRequest.set_time_cursor = 6: store_id = 1, timeline.name = 2.1, time.time = 3.1, play_state = 5 (paused).
+  // Protobuf field numbers: set_time_cursor of ViewerControlRequest = 6; in it store_id = 1, timeline.name = 2.1, time.time = 3.1,
+  // play_state = 5 (paused).
   const set_time = (recording, step) => new Uint8Array(field(6, [
     ...field(1, text(recording)), ...field(2, field(1, text("step"))), ...field(3, [8, ...varint(step)]), 40, 1]));
   const go = async (recording, step) => {

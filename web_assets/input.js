@@ -1,25 +1,26 @@
 // Sends the user's input as numbered commands over one WebSocket, in order. The server replies to each.
 //
 //   data-page="x7Hq"                         this page's name, assigned by the server
-//   data-keys='[["s","live","step",true]]'   keys: key, context, command, whether a held key repeats it; data-contexts are always on
+//   data-keys='[["s","live","step",true]]'   keys: key, context, command, whether a held key repeats it;
+//                                            data-contexts: contexts whose keys always work
 //   data-context="library"                   while this element is in the page, the keys of that context work
 //   data-do='["select_env", {"env": 3}]'     command of a press
-//     data-held="held"                         its field for the modifier keys: "", "ctrl", "shift", "ctrl+shift"
+//     data-held="held"                         the command's field for the modifier keys: "", "ctrl", "shift", "ctrl+shift"
 //     data-twice='["open_row", {...}]'         command of a double press
-//     data-place                               its fields x and y: the position in the element, 0 to 1 from the upper left corner
-//     data-along='["step", 0, 99]'             its field for the position along the element: an integer between these
+//     data-place                               the command's fields x and y: the position in the element, 0 to 1 from the upper left
+//     data-along='["step", 0, 99]'             the command's field for the position along the element: an integer from 0 to 99
 //   data-hover='["hover_body", {"body": "cube"}]'  command while the pointer is on this element; then again with empty fields
 //   data-copy="text"                         a press copies this text
-//   data-tell='["tell_unfolded", {...}]'     command when the element is added (data-only: only if <html> has data-…)
-//   data-into-sight                          scroll the parent into view when added; data-follow="7": the library's row with that number
+//   data-tell='["tell_unfolded", {...}]'     command sent when the element is added (data-only="x": only if <html> has data-x)
+//   data-into-sight                          scroll the parent into view when added; data-follow="7": the library's row 7
 //   data-title="PushCube"                    title of the browser's tab; without one the last title stays
-//   data-field='["set_seed", {}, "seed"]'    the value goes into the last named field: committed on Enter or blur, when an option is
-//                                            chosen, or (data-live) on every input; Enter sends data-enter
+//   data-field='["set_seed", {}, "seed"]'    command, its other fields, and the field for the value: committed on Enter or blur, when an
+//                                            option is chosen, or (data-live) on every input; Enter sends data-enter
 //     data-number="[0, null, 1, true]"         a number: minimum, maximum, step of an arrow key, whether it is an integer
 //   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrow keys from it
 //                                            into the list, starting at data-best
-//   data-shows='[["text.set_seed.seed", "12", false, {}]]'  the server's value for the field of this name, copied into it while it is
-//                                            not in use; whether it is disabled; new options ([label, value]) or bounds
+//   data-shows='[["text.set_seed.seed", "12", false, {}]]'  name of a data-field element; the server's value, copied into the element
+//                                            while it is not in use; whether it is disabled; new options ([label, value]) or bounds
 "use strict";
 {
   const STILL = 6; // maximum pixels that a press may move
@@ -34,8 +35,8 @@
   let socket = null;
   let page = "";
   let sent = 0;
-  const unanswered = new Map(); // number -> the data-field or the pressed element's data-do
-  const newest = new Map(); // the same key -> the newest value, waiting for the reply to the previous one
+  const unanswered = new Map(); // message number -> data-field of the input, or data-do of the dragged element; else empty
+  const newest = new Map(); // the same data-field or data-do -> the newest command; it waits for the reply to the previous one
   const early = []; // messages from before the socket was open
 
   let notice = null;
@@ -128,7 +129,7 @@
     document.body.append(gone);
   }
 
-  // After the token was renewed the server refuses the connection; its page then explains what to do.
+  // After the token was renewed the server refuses the connection. A reload shows its refusal page, which says what to do.
   async function reloadIfShutOut() {
     const reply = await fetch("/workbench/logo.svg", { cache: "no-store" }).catch(() => null);
     if (reply?.status === 403) location.reload();
@@ -157,7 +158,7 @@
     return [name, said];
   }
 
-  // Returns the command for each position in an element; computed once, since the next redraw replaces the element.
+  // Returns a function from the pointer's position to the command. The element is read only now: the next redraw replaces it.
   function commandAt(element) {
     const [name, fields] = JSON.parse(element.dataset.do);
     const { left, top, width, height } = element.getBoundingClientRect();
@@ -239,7 +240,7 @@
   const MOVES = /^(Enter| |Arrow.*|Home|End|Page.*)$/;
   const NAMES = { " ": "space" };
   const OPENS = /^ctrl\+(k|o|shift\+p)$/; // keys of the palette and of the list of tasks
-  let opening = 0; // until when a window may open; keys typed meanwhile are meant for it and trigger nothing here
+  let opening = 0; // time until which a window may open; keys typed meanwhile are meant for it and trigger nothing here
   const PRESSED = "[data-do], [data-copy], [data-fold]";
   let keys = []; // [key, context, command, repeats]; kept while a folded panel removes them from the page
   let always = [];
@@ -276,7 +277,7 @@
     return found.sort((a, b) => on.indexOf(a[1]) - on.indexOf(b[1]))[0];
   }
 
-  // A copy, which a redraw does not remove.
+  // Shows a copy of the list: a redraw may remove the original.
   function toggleKeyList() {
     const shown = document.querySelector("body > .wb-all-keys:popover-open");
     if (shown || !keyList) return shown?.hidePopover();
@@ -459,8 +460,8 @@
     },
   );
 
-  // Copy the server's values into inputs that are not in use; also into the field `refused`, whose value was refused, unless more
-  // was typed since.
+  // Copy the server's values into inputs that are not in use. Also into two inputs that may be in use: `into`, and the input with
+  // the data-field `refused`, whose value was refused (unless the user has edited it since).
   function showValues(refused = "", into = null) {
     for (const shows of document.querySelectorAll("[data-shows]")) {
       for (const [name, value, off, { options, bounds }] of JSON.parse(shows.dataset.shows)) {
@@ -535,7 +536,7 @@
 
   // --- elements added to the page -----------------------------------------------------------------------------------------
 
-  // By data attribute: what to do once with each element that has it.
+  // Functions by data attribute: each is called once for each element that has the attribute.
   const arrivals = {
     tell(element) {
       const { tell, only } = element.dataset;

@@ -1,16 +1,18 @@
-// Features that viser's tabs, folds and palette lack. To request from viser: a tab group whose open tab the server can set and
-// is notified of; folds that the server and the keyboard can open; palette commands that open an address.
+// Features that viser's tabs, folds and palette lack. To request from viser: a tab group whose open tab the server can set, and
+// which reports its open tab; folds that the server and the keyboard can open; palette commands that open an address.
 //
-//   data-which="3f2a"      id of the page's content: when the user returns to it, its last open tab is restored (data-anew: the first)
+//   data-which="3f2a"      id of the page's content: when the user returns to it, its last open tab is restored
+//                          (with data-anew: its first tab)
 //     data-says              report the open tab to the server
-//   data-open-tab="Reward" open this tab, and in it data-open-fold; the keys 1 to 9 open the tabs of that panel
+//   data-open-tab="Reward" open this tab, and in it the fold data-open-fold; the keys 1 to 9 open the tabs of the panel
+//                          with data-which
 //   data-toggle="timeline-open"  add or remove this attribute of <html>, for the style sheet
 "use strict";
 {
   const KEEPS = "workbench tab of ";
   const OPEN = "workbench open ";
   const COMES = 5000; // milliseconds within which the tabs appear
-  const SETTLES = 1000; // milliseconds from the first tab on; until all exist viser reopens the first
+  const SETTLES = 1000; // milliseconds from when the wanted tab exists; until all tabs exist, viser reopens the first one
   const FOLD_COMES = 2000;
 
   // --- tabs -------------------------------------------------------------------------------------------------------------
@@ -57,7 +59,7 @@
   });
   const heldIn = ({ ctrlKey, metaKey, altKey }) => ctrlKey || metaKey || altKey;
 
-  // What is open stays so in this tab of the browser, over the review and a reload.
+  // What is open stays open in this tab of the browser, also after a visit to the review and after a reload.
   const html = document.documentElement;
   function setOpen(name, isOpen) {
     html.toggleAttribute(name, isOpen);
@@ -95,7 +97,7 @@
     wb.ask(["tell_open_tab", { tab: told.name }]);
   }
 
-  // --- folds: a sheet within a bordered sheet, with an arrow after its label; it reacts only to a click --------------------
+  // --- folds: a fold is a sheet within a bordered sheet, with an arrow after its label; it reacts to clicks, not to keys ----
 
   const ARROW = "svg:is(.tabler-icon-chevron-down, .tabler-icon-chevron-up)";
   const ICONS = { "list-search": "Commands (Ctrl+K)", adjustments: "Scene tree and settings", "arrow-back": "Back to the panels" };
@@ -136,7 +138,8 @@
 
   // --- the palette --------------------------------------------------------------------------------------------------------
 
-  // A browser allows opening a tab only while it handles a press, and the server gets the command later. Enter is a click too.
+  // A browser allows opening a tab only while it handles a press, and the server gets the command later: so the script opens
+  // the document. Enter is a click too.
   addEventListener("click", ({ target }) => {
     const action = target.closest?.(".mantine-Spotlight-action");
     const textOf = (part) => action?.querySelector(`.mantine-Spotlight-action${part}`)?.textContent ?? "";

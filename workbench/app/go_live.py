@@ -42,7 +42,7 @@ from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
 
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4
-"""Number of envs of a new session if all envs get the recorded state."""
+"""Number of envs of a new session if all envs get the recorded state; 1 if only the selected env does."""
 
 
 _POLL_SECONDS = 0.05
@@ -61,13 +61,13 @@ class _Transition:
     state: int
     given_up: bool = False
     asks: bool = False
-    """Whether a user may have to allow the code to run."""
+    """Whether `Clearances` may be asking the user for permission to run the code."""
     number: int = 0
     """Value of `TimelineView.entered` once the env has the recorded state."""
     problems: int = 0
     session: Session | None = None
-    """Session that gets the recorded state; None until the consent is given. Set last, because `is_over`
-    reads the other fields once it is set."""
+    """Session that gets the recorded state; None until it is open. Set after the other fields, because
+    `is_over` reads them as soon as `session` is set."""
 
     def is_over(self) -> bool:
         """Whether to show the live page now: the state is restored, the task failed, or the task has been
@@ -161,9 +161,9 @@ class GoLive:
                 self._transition = None
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
-        """A session that already runs this task with its current code, not with recorded code: that of the
-        live page, else the one that the user opened. None if neither does. The session of the live page is
-        also returned if it has not loaded its task yet."""
+        """The live page's session, or else the session that the user opened, if it already runs this task
+        with the current code (not with recorded code); None if neither does. The live page's session is also
+        returned if it has not loaded its task yet."""
         session = self._shared.session
         if session is not None and (self._own is None or self._own[1] is None):
             task = session.view().task
@@ -209,7 +209,7 @@ class GoLive:
         return opened[0]
 
     async def _enter(self, session: Session, transition: _Transition) -> None:
-        """Put the recorded state into the env, and show the live page once it is there."""
+        """Put the recorded state into the env, and show the live page when the transition is over."""
         self._shared.session = session
         transition.problems = session.view().problem_serial
         transition.number = session.enter_recording(
@@ -238,7 +238,7 @@ class GoLive:
             self._transition = None
 
     def can_go_home(self) -> bool:
-        """Whether the live session is not the session that the user opened."""
+        """Whether the user has opened a session, and the live page shows another one."""
         home = self._shared.home
         return home is not None and self._shared.session is not home
 
@@ -260,8 +260,8 @@ class GoLive:
         """End the session opened here. The pages must have been stopped. Must not be called on the loop."""
         do(self.let_go)
         self._opening.close(_OPEN_TIMEOUT_SECONDS)
-        # A session may just have opened. Its transition, which runs on the loop, begins to end it: wait for
-        # that.
+        # If a session has just opened, its cancelled transition, which runs on the loop, hands the session to
+        # `_ending`: wait for that.
         do(lambda: None)
         self._ending.close()
 

@@ -28,8 +28,8 @@ HEADERS = {
     "Cache-Control": "no-cache",
 }
 _INTRODUCTION_CHARACTERS = 1000
-"""Number of characters at the start of a page that count as its introduction. A search puts the pages first
-whose introduction contains the words."""
+"""Number of characters at the start of a page that count as its introduction. In a search, pages whose
+introduction contains the words come first."""
 _LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
 OVERVIEW = "overview"
 """The topic made of the README."""
@@ -41,7 +41,8 @@ GROUPS = (
 )
 """(folder of documents, its heading in the list of topics): the heading states the reader's goal."""
 RULE_PAGES = "rules"
-"""Folder with a page for each rule of `checks`. The list of topics omits them; the topic ``rules`` has a table."""
+"""Folder with a page for each rule of `checks`. The list of topics omits these pages; the topic ``rules``
+lists them in a table."""
 FIRST = (
     OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
     "sweep", "cluster", "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",

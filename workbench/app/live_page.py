@@ -218,8 +218,8 @@ class Page:
         server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
 
     def _is_shown(self, tab: str, view: SessionView) -> bool:
-        """Whether a page may show this tab. While paused, every tab is drawn: there is little to send, and a tab that is
-        opened must not show an earlier moment."""
+        """Whether this tab counts as shown. While playing, only if a page may have it open. While paused,
+        always: there is little to send, and a tab that is opened then must not show an earlier moment."""
         return not view.playing or self._open_tabs.may_show(tab)
 
     def _is_own(self, file: str) -> bool:
@@ -377,7 +377,7 @@ class Page:
         visitor.send(render("open_address", link=link))
 
     def _unfolded(self, panel: str) -> None:
-        """Handle the report of a page that the user unfolded this panel."""
+        """Handle a page's report: the user has unfolded this panel."""
         if panel == ENVS:
             self._envs_open = True
             self._fit_envs()

@@ -34,8 +34,8 @@ EPISODES = "Episodes"
 
 
 class Marks(PagePart[SessionView]):
-    """The row of marks between the status line and the tabs. The marks are not part of the status line, which
-    is redrawn four times a second: a press on a mark there would be lost.
+    """The row of marks between the status line and the tabs. The marks are not part of the status line, whose
+    frequent redraws would replace a mark while it is pressed.
 
     Args:
         server: The page.

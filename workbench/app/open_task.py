@@ -30,7 +30,7 @@ OpenSession = Callable[[TaskName, TaskOptions, KeptWork | None], Session]
 
 @dataclass(frozen=True)
 class Choices:
-    """Recent tasks, which the list shows besides the tasks that it finds; and how a chosen task is opened."""
+    """The recent tasks, which the list shows in addition to those that it finds, and how to open a task."""
 
     recents: RecentTasks
     open_session: OpenSession
@@ -174,7 +174,7 @@ class OpenTask:
         if old is not None:
             old.do(PauseRun())
             self._kept[self._open_reference] = old.kept_work()
-            # Not a `RecordedTask`: the user allowed only its texts, and its file may contain others by now.
+            # Not a `RecordedTask`: the user allowed only the recorded texts; the file may have changed since.
             if isinstance(old.reference, str):
                 self._ran.add(self._open_reference)
         kept = self._kept.get(entry.lasting)

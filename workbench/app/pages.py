@@ -27,7 +27,7 @@ FRAME_SECONDS = 1 / 30
 """Time from one frame to the next. More frequent updates slow a browser down (measured: at 350 updates
 a second it draws 13 to 30 frames a second)."""
 PANELS_TIMEOUT_SECONDS = 0.01
-"""Longest time in each frame that the 3-D view waits for the panels to be sent."""
+"""Maximum time per frame for which the 3-D view waits until the panels are sent."""
 RETRY_SECONDS = 1.0
 """Time after which a page that could not be drawn is drawn again."""
 _IDLE_SECONDS = 0.1

@@ -261,7 +261,7 @@ class ReviewPage:
             self._show_library(False)
 
     def _sweep_of(self, library: Library) -> SweepPanel | None:
-        """The tab with the results of a sweep, if the folder has results."""
+        """Add the tab with the results of a sweep; returns None if the folder has no such results."""
         if library.view().sweep is None:
             return None
         with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
@@ -274,7 +274,7 @@ class ReviewPage:
             self._parts.add(sweep)
 
     def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
-        # If there is room, the panel stays open: the user compares several episodes of the sweep.
+        # If there is room, the sweep's table stays open: the user compares several of its episodes.
         self._review.open(ids, library_stays=self._smallest_view() >= MIN_VIEW_BY_SWEEP_PIXELS)
 
     # --- drawing ---------------------------------------------------------------------------------
@@ -366,7 +366,7 @@ class ReviewPage:
                 self._fold_other(False)
 
     def _panel_unfolded(self, panel: str) -> None:
-        """Handle the report of a page that the user unfolded this panel."""
+        """Handle a page's report: the user has unfolded this panel."""
         if panel == LIBRARY:
             self._library_open = True
         self._unfolded = panel, self._clock()
@@ -374,7 +374,8 @@ class ReviewPage:
     def _fold_what_crowds(self) -> None:
         """If library and rerun leave no room for the view, fold the one that was unfolded first.
 
-        A page reports the new width of its view with a delay, which is seconds while rerun loads.
+        A page reports the new width of its view late (by seconds while rerun loads), so the width is checked
+        for `WIDTH_TIMEOUT_SECONDS` after a panel was unfolded.
         """
         last, since = self._unfolded
         if not last or not 0 < self._smallest_view() < MIN_VIEW_PIXELS:

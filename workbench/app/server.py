@@ -36,7 +36,7 @@ class App:
     Args:
         gated_server: The server of the pages.
         recordings: The folder that is recorded to and reviewed.
-        make_session: Opens a task that a recording names, with these options.
+        make_session: Opens a task that a recording names, with the given options.
         base: Options that all tasks named by recordings share.
         session: The live env, if there is one.
         tasks: Task files that may define the envs of foreign recordings.

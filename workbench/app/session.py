@@ -111,7 +111,7 @@ class Session:
             task: a file, ``file.py:ClassName``, or a registered env id; or a cleared task of a recording.
             recordings: folder for recorded episodes; created when the first is written.
             history_bytes: memory limit of the history.
-            worker: limits of the worker process, and whether there is a spare one.
+            worker: limits of the worker process, whether a spare process is kept, and debugging.
             kept: work of the previous session of this task; its options replace `options`.
             check: whether the rules are checked after each load, until a `CheckAfterSave` changes this.
             make_worker: makes the supervisor; tests without a worker process replace it.
@@ -303,7 +303,7 @@ class Session:
         return self._state.rescoring.curve(name, env)
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Block until the counter of changes differs from `seen`; returns the counter."""
+        """Wait up to `timeout` seconds until the change counter differs from `seen`; returns the counter."""
         return self._changes.wait(seen, timeout)
 
     @on_loop

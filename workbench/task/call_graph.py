@@ -36,7 +36,7 @@ _INTROSPECTION_MODULES = frozenset(
 
 @dataclass(frozen=True)
 class Symbol:
-    """A function, method, constant, class attribute or import.
+    """A function, method, constant, class attribute, import or class; or the other statements of a scope.
 
     Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as a mention of every ``reset`` in
     all files. A string that is an identifier counts as a name (``getattr(self, "reset")``). For computed
@@ -155,7 +155,7 @@ def _defines(statement: ast.stmt, at_top: bool) -> str | None:
 
 def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
     """The statements of `body`, with one import statement for each imported name: ``from x import a, b``
-    becomes two statements. So a name can be added to it without changing the symbols of a and b."""
+    becomes two statements. So a name can be added to the import without changing the symbols of a and b."""
     for statement in body:
         if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
             # Skip it: annotations are ignored, and the other features are the default now.
@@ -268,7 +268,8 @@ def _remove_docstrings(tree: ast.Module) -> None:
 
 class TwoVersions:
     """One graph of both versions. A node is a `Key` (file and name): it stands for the symbols of both
-    versions that have this file and name. Its edges lead to every symbol that a name in one of them may mean.
+    versions that have this file and name. Its edges lead to every symbol that a name in these symbols may
+    mean.
 
     Pure: nothing is imported or executed.
     """

@@ -71,8 +71,8 @@ def copied_text(
     """The text of the copy, and a pair for each registered id: the original's id and the copy's id.
 
     Only the ids, and code that depends on the file's place, change. Relative imports become absolute.
-    ``__file__`` becomes that of the installed module, beside which the assets are. Registered ids get another
-    name. Without `names`, the rest is identical.
+    ``__file__`` becomes the ``__file__`` of the installed module, because the assets are next to that module.
+    Registered ids get another name. Without `names`, the rest is identical.
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.

@@ -69,7 +69,7 @@ def command_line(reference: str, options: TaskOptions) -> str:
 
 
 def _argument_text(value: Any) -> str:
-    """The text that ``--env`` parses to this value: JSON; for a string that is not JSON, the string
+    """The text that ``--env`` parses to this value: its JSON, but for a string that is not JSON, the string
     itself."""
     if isinstance(value, str):
         try:
@@ -134,7 +134,7 @@ class TaskDescription:
     objects: tuple[ObjectToSee, ...] = ()
     """Objects for which a camera report can state how well a camera sees them."""
     joints: tuple[str, ...] = ()
-    """Names of `StepResult.qpos`."""
+    """Names of the joints whose positions are in `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
     """Notices about a working task, as sentences."""
     parse_cameras: str = "parse_camera_configs"
@@ -160,7 +160,7 @@ class Restored:
     env_idx: tuple[int, ...]
     """The envs that were set."""
     source: tuple[int, ...]
-    """For each env of `env_idx`: the env of the snapshot whose state it got."""
+    """For each env of `env_idx`: the index, in the snapshot, of the env whose state it got."""
     origin: int
     """The server's number of the restored moment, or `NO_MOMENT`."""
     undoes: int | None
@@ -216,7 +216,7 @@ class Stepped:
     """(N, ...) arrays by the names of `envs.state_columns`: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
     acted_by: str = ""
-    """Source of this step's action, for a recording; empty if the source is known before the episode."""
+    """Source of this step's action, for a recording; empty: the recording keeps the source that it has."""
     placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
     """The cameras that are placed by hand (only while capturing)."""
     resumed: bool = False

@@ -81,7 +81,7 @@ def find_task_files(folder: Path, read: Callable[[Path], TaskFile | None] | None
     """The task files in and below a folder.
 
     Hidden folders, Python environments, installed packages and links are left out. With too many files, or after the
-    timeout, the search ends early and says so in the result.
+    timeout, the search ends early; `FoundTasks.left_out` says why.
 
     Args:
         read: reads a file; None for `read_task_file`.

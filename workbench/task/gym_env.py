@@ -75,9 +75,10 @@ def make(
         rules: rules of GPU simulation, checked on the CPU: ``stop`` raises if one is broken, ``warn`` warns,
             ``off`` checks none. None: raises if a task overwrites the state of other envs, and warns for all
             other rules; for an installed task, only warns.
-        pictures: ``exact``: identical to stock ManiSkill, to the bit. ``fast``: several times as many per
-            second on the CPU, because robots and other heavy meshes are simplified to the detail that the
-            cameras can see; warns that a policy trained on such pictures sees different pictures on a GPU.
+        pictures: ``exact``: identical to stock ManiSkill, to the bit. ``fast``: several times as many
+            pictures per second on the CPU, because robots and other heavy meshes are simplified to the detail
+            that the cameras can see; warns that a policy trained on such pictures sees different pictures on
+            a GPU.
         kwargs: arguments of ``gym.make`` for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
             ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
 

@@ -28,7 +28,8 @@ _INSTALLED = tuple(
 LIBRARY_ROOTS = (str(Path(__file__).resolve().parents[1]) + os.sep, *_INSTALLED)
 """Folders without files of an author: the workbench's, and those that Python installs into."""
 _INSTALLED_BY_MISTAKE = {"docs", "example", "examples", "scripts", "test", "tests", "utils"}
-"""Packages install such folders by mistake (sapien 3.0.3: ``example``); authors have folders of these names too."""
+"""Names of folders that packages install by mistake (sapien 3.0.3: ``example``). Authors have folders of
+these names too."""
 
 _author_folders: set[str] = set()
 """Every folder that was put on ``sys.path`` for an author."""

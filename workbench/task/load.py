@@ -144,7 +144,7 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
 
     All or nothing: the file is executed again with the modules of its folder. If that fails, the modules,
     registrations and texts for tracebacks of the last good version are restored: that version may be running,
-    and import lazily.
+    and may import more modules later.
 
     Args:
         reference: a `RecordedTask` opens only a registered id or approved texts, never a path.

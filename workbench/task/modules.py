@@ -161,7 +161,7 @@ class AuthorFinder(MetaPathFinder):
 
     @property
     def _is_newest(self) -> bool:
-        """Whether this finder's task was loaded last: an import is then one of this task."""
+        """Whether this finder's task was loaded last: imports then count as imports of this task."""
         return next((f for f in sys.meta_path if isinstance(f, AuthorFinder)), None) is self
 
     def text(self, path: str) -> str:

@@ -352,9 +352,9 @@ _SMALL_TASK = "PickCube-v1"
 def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
     """Warm up a process: make a small env, render it, and close it. Ends early when `keep_going` returns False.
 
-    Making the first env of a process (N = 4) and reading its shapes takes 1.2 s on two cores; the second env
-    takes 0.12 s. The first picture of each kind of camera compiles its shaders. The robot's files, the render
-    system and the shaders are the same for any task.
+    Making the first batch of envs in a process and reading its shapes takes 1.2 s on two cores (measured with
+    4 envs); the second batch takes 0.12 s. The first picture of each kind of camera compiles its shaders. The
+    robot's files, the render system and the shaders are the same for any task.
 
     A TaskError of the build is ignored: the author's own load would fail too (no renderer, no GPU), and its
     report is better.

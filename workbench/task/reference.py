@@ -186,7 +186,8 @@ def is_module_name(text: str) -> bool:
 
 
 def find_module(name: str) -> NamedModule | None:
-    """The module `name` as Python would find it, else in the current folder; None if it has no source file.
+    """The module `name`, found as Python finds it, or else in the current folder. None if it is not found, or
+    has no source file.
 
     The current folder is not on ``sys.path`` of the command, but a person expects names to be found there.
     """

@@ -91,13 +91,14 @@ def find_change(
 
     Building a scene takes a second and loses the current moment, and most saves change a line of the reward. So the two
     versions are compared symbol by symbol. The new file is executed as a whole at every level. What remains
-    of the old version on a live env is what the *building* code made: `_load_scene` and the other build
-    hooks, robots and other classes, module-level statements, and everything that these mention, transitively.
-    A change in building code means rebuilt. Other code can be replaced unless state may outlive the
-    replacement (`workbench.task.kept_state`): values that hooks keep between calls, module-level dicts and
-    lists that are filled while the task runs, attributes that only the old version writes, objects of the
-    author's classes. If code may reach further than the names in it (``exec``), nothing is replaced. In doubt
-    the level is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
+    of the old version on a live env is what its building code made. Building code is `_load_scene` and the
+    other build hooks, robots and other classes, module-level statements, and everything that these mention,
+    directly or indirectly. A change in building code means rebuilt. Other code can be replaced unless state
+    may outlive the replacement (`workbench.task.kept_state`): values that hooks keep between calls,
+    module-level dicts and lists that are filled while the task runs, attributes that only the old version
+    writes, objects of the author's classes. If code may reach further than the names in it (``exec``),
+    nothing is replaced. In doubt the level is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched"
+    shows numbers of mixed code.
 
     Pure: nothing is imported or executed. Does not raise, whatever the texts contain.
     """

@@ -23,7 +23,7 @@ READ_SECONDS = 0.25
 """Interval of reading the files even if their ``stat`` is unchanged: a network mount may update ``stat``
 late, and two saves within one tick of a file system's clock have the same ``stat``."""
 GONE_SECONDS = 0.3
-"""A file that is missing or empty for a shorter time counts as half of a save, not as new content."""
+"""A file that is missing or empty for a shorter time counts as an unfinished save, not as new content."""
 STOP_SECONDS = 1.0
 """Maximum wait for the end of the thread: a read on a disk that hangs cannot be cancelled."""
 POLL_SHARE, READ_SHARE = 0.003, 0.001
@@ -35,8 +35,8 @@ Content = str | bytes | None
 """A file's text; its bytes if they are not text; None if it is missing or unreadable (device, pipe, too
 large)."""
 Statuses = dict[Path, tuple[int, ...]]
-"""By file: the fields of ``stat`` that change with the file's content, modification time first; empty if
-there is no such file."""
+"""The fields of ``stat`` that change with a file's content, modification time first, by file; empty for a
+file that does not exist."""
 
 
 class SourceWatcher:

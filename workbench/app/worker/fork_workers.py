@@ -97,12 +97,12 @@ class _ForkServer:
                 self._fork(Unpacker().unpack(message, NewWorker), fds)
 
     def _signal(self, pid: int, end: socket.socket) -> None:
-        """Handle a message on a worker's socket: a signal number to send, or the end of the connection."""
+        """Send a worker's keeper the signal requested on its socket, or SIGTERM if the client closed it."""
         try:
             asked = end.recv(_MAX_MESSAGE_BYTES)
         except ConnectionResetError:  # the client closed the socket without reading our message
             asked = b""
-        # It is our child: the kernel does not reuse its pid before we have waited for it.
+        # The keeper is our child: the kernel does not reuse its pid before we have waited for it.
         os.kill(pid, Unpacker().unpack(asked, int) if asked else signal.SIGTERM)
         if not asked:
             self._workers.pop(pid).close()

@@ -191,7 +191,7 @@ class Worker:
     # --- questions ---------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
-        """Answer a call. It always sends an answer: otherwise, the server's thread would wait for ever."""
+        """Answer a call. An answer is always sent: without one, the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
         problem = self._task.run(doing, lambda: answers.append(self._answer(call)))
@@ -429,8 +429,8 @@ class Worker:
             self._chooser.use(s.action_source, s.policy, folder)
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
-            # Before a task is loaded, the page would take this failure for a failed load. The first step then
-            # reports it.
+            # Before a task is loaded, the page would take this failure for a failed load. In that case the
+            # first step reports the failure.
             if self._task.opened is not None:
                 self._task.fail(error.problem)
             return False
@@ -661,7 +661,7 @@ class Worker:
 
 
 def _led_there(request: Restore | EnterRecording) -> Mapping[int, NDArray[np.float32]]:
-    """By env: the last action (A,) before the restored state. Envs for which it is unknown are omitted."""
+    """The last action (A,) before the restored state, by env, without envs whose last action is unknown."""
     if isinstance(request, Restore):
         return {env: way.actions[-1] for env, way in request.ways.items() if len(way.actions)}
     run = request.run
@@ -690,7 +690,7 @@ _DOING: dict[type, Doing] = {
     DrawTask: "drawing",
     ListenForDebugger: "starting",
 }
-"""Requests and questions that may run the author's code or take long."""
+"""Requests and questions that may run the author's code or take long, each with its activity."""
 
 
 def work(connection: int, heartbeat: HeartbeatWriter) -> None:

@@ -24,12 +24,12 @@ def main() -> None:
 
 
 def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: int) -> None:
-    """Fork: the child becomes the worker, this process its keeper.
+    """Fork: the child becomes the worker, and this process becomes its keeper.
 
     `connection`, `heartbeat_fd` and `stacks` are file descriptors (see `WorkerProcess`), `server` is the
-    process id of the parent. Before heavy modules are imported, this is set up: a crash writes its stack, the
-    server can request the stack by a signal, the kernel kills this process first when memory is short, and
-    the process ends with its server (`family`).
+    process id of the parent. Before it imports heavy modules, the worker sets up the following: a crash
+    writes its stack; the server can request the stack by a signal; when memory is short, the kernel kills the
+    worker first; and the worker ends with its server (`family`).
     """
     begin_family(server)
     if niceness:

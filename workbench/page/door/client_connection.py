@@ -40,9 +40,9 @@ class PageConnection:
     """Sends viser's messages to one page as fast as it acknowledges them.
 
     A socket buffers megabytes before a sender has to wait, and so does ``ssh -L``. On a slow connection these
-    take seconds, and the reply to a click waits behind them. So each message is followed by a ping, which a
-    browser answers when it has read everything before the ping. While `send` waits, viser collects changes
-    and later sends only the newest.
+    megabytes take seconds, and the reply to a click waits behind them. So each message is followed by a ping,
+    which a browser answers when it has read everything before the ping. While `send` waits, viser collects
+    changes and later sends only the newest.
 
     Used on the event loop of the connection.
     """

@@ -10,7 +10,7 @@ import msgspec
 T = TypeVar("T")
 
 MAX_BYTES = 256 * 1024
-"""Maximum size of a message; the largest is a pasted text. viser's pictures of a view are never requested."""
+"""Maximum size of a message. The largest is a pasted text: viser's pictures of a view are never requested."""
 MAX_NUMBER = 1e12
 """Maximum absolute value of a number of a camera, a ray or a gizmo, in any unit."""
 MAX_SIDE_PIXELS = 100_000

@@ -47,9 +47,9 @@ class ConnectionLimits:
 
     A connection costs a task and buffers before its client has presented the token, so until then its
     duration and the size of its head are limited, and so is the number of such connections. If there are too
-    many, the oldest one of the peer that has the most is closed, not the newest: a browser sends its request
-    with the first packet, and idle sockets of an attacker must not lock the browser out. (Chromium holds some
-    idle sockets itself, and opens new ones when they are closed.)
+    many, the peer with the most connections loses its oldest one, not the newest: a browser sends its request
+    with the first packet, and idle sockets of an attacker must not lock the browser out. (Chromium itself
+    holds some idle sockets, and opens new ones when these are closed.)
     """
 
     def __init__(self, told: RateLimitedLog) -> None:
@@ -166,8 +166,9 @@ async def close_when_stalled(
     removal until each client has read it. The ping of `websockets` would wait behind the unsent bytes.
 
     The client counts as stalled if bytes are queued and, for `READ_TIMEOUT_SECONDS`, no check finds fewer
-    bytes than the check before it. Bytes that are written meanwhile do not restart this time. A slow client
-    reads some bytes from time to time. A page that wakes up reconnects and gets the present state.
+    bytes than the check before it. Bytes that are written meanwhile do not restart this time. A client that
+    is merely slow reads some bytes from time to time, so it does not count as stalled. A page that wakes up
+    reconnects and gets the present state.
 
     Args:
         unanswered: Returns the bytes that the page has not acknowledged, see `PageConnection.unanswered`.
@@ -218,7 +219,7 @@ class RateLimitedLog:
         """Log an event, or count it if its kind was logged recently.
 
         Args:
-            kind: Events with equal kinds count as the same.
+            kind: Events with equal kinds share one pause.
             sentence: The line, with a full stop; control characters are shown escaped.
             error: Logged with its traceback if the line is logged.
         """

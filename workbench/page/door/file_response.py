@@ -144,8 +144,9 @@ _POLICY = {
 class Downloads:
     """The files that a page may fetch. One object per `GatedServer`.
 
-    A browser never sends a path: it gets an address with a random part for one file, and the file is looked up by that part
-    alone. The name after it is for people (and for rerun, which recognizes a recording by its suffix).
+    A browser never sends a path: it gets an address with a random part for one file, and the file is looked
+    up by that part alone. The file name at the end of the address is for people (and for rerun, which
+    recognizes a recording by its suffix).
     """
 
     def __init__(self, add_route: AddRoute) -> None:

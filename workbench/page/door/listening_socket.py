@@ -139,7 +139,8 @@ def listen_on_file(path: Path, port: int) -> Listening:
         port: Port on the browser's machine, at the other end of ``ssh -L``.
 
     Raises:
-        ServerError: `path` exists and is something else, or other users may write into its folder.
+        ServerError: `path` exists and is not the socket of a killed workbench, or other users may write into
+            its folder.
     """
     folder = path.expanduser().absolute().parent.resolve()
     place = folder / path.name

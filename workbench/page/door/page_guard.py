@@ -22,7 +22,7 @@ BURST_MESSAGES = 400.0
 MESSAGE_BYTES = 2048
 """Block size: a message counts once, and once more for each full block."""
 MAX_SLOWED_SECONDS = 5.0
-"""Maximum time that a page is slowed down without a pause; then its connection is closed."""
+"""Maximum total wait of a page that sends too fast without a break; then its connection is closed."""
 MESSAGES_PER_TURN = 16
 """Number of messages after which the event loop serves the other pages."""
 

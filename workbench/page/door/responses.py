@@ -139,8 +139,8 @@ async def admitted_reply(
 
 
 def _is_path_of_files(path: str) -> bool:
-    """Whether a file below a folder could have this path. The system raises on a name that is too long or
-    contains a NUL."""
+    """Whether a file below a folder could have this path. False for a path with ``..``, and for a path on
+    which the system would raise: too long, or with a NUL."""
     parts = path.encode("utf-8", "surrogatepass").split(b"/")
     return (
         b".." not in parts

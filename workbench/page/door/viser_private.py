@@ -121,8 +121,8 @@ def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
 
 
 def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
-    """Yield (tab, fold), in order of creation: for each tab in a tab group its label and an empty text; for
-    each fold the label of the tab around it (empty outside tabs) and its own label."""
+    """Yield pairs of labels, in order of creation: (tab, "") for each tab in a tab group, and (tab around the
+    fold, fold) for each fold; the first label is empty for a fold outside tabs."""
     containers = server.gui._container_handle_from_uuid
     for handle in list(containers.values()):
         if isinstance(handle, viser.GuiTabHandle):
@@ -361,10 +361,10 @@ def make_viser(
 
     viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, without a
     way to check a request first, choose the socket, refuse a message or suppress output. So while the server is made, the
-    name ``websockets`` in that module is a stand-in whose ``serve`` is ours. It passes viser's arguments on,
-    but changes among others the socket, ``process_request``, compression and the handler. Our handler checks
-    every message first, sends as fast as the page acknowledges, and closes stalled clients. `missing_names`
-    is checked before, and `gated_server` tests the result with a forbidden request.
+    name ``websockets`` in that module is a stand-in whose ``serve`` is ours. Our ``serve`` passes viser's
+    arguments on but changes some, such as the socket, ``process_request``, compression and the handler. Our
+    handler checks every message first, sends as fast as the page acknowledges, and closes stalled clients.
+    `missing_names` is checked before, and `gated_server` tests the result with a forbidden request.
 
     Args:
         listening: bound and listening; the server owns it from here on.
@@ -428,7 +428,8 @@ def make_viser(
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     with unchanged_environment():
-        # For its first picture viser imports OpenCV, which adds the working directory to the library path of all children.
+        # For its first picture viser imports OpenCV, which adds the working directory to the library path
+        # of all child processes.
         server.gui.add_image(np.zeros((1, 1, 3), np.uint8)).remove()
     return GatedViser(server, serving[0], channels)
 

@@ -42,9 +42,10 @@ class SceneView:
     """The batched nodes of one scene under ``/envs``.
 
     One viser node per body is too slow in a browser from a hundred bodies on (measured: 1 frame a second at
-    3,840); one batched node per shape is not (30 a second). A frame is two arrays per node, world positions
-    and quaternions: poses in the envs' frames plus the envs' grid offsets. World poses, not parent frames:
-    viser's batches bypass its scene graph, and a parent that moves in the same frame makes them shake.
+    3,840); one batched node per shape is not (30 a second). In each frame a node gets two arrays: world
+    positions (those in the envs' frames plus the envs' grid offsets) and quaternions. World poses, not parent
+    frames: viser's batches bypass its scene graph, and a parent that moves in the same frame makes the
+    batches shake.
 
     If one env is shown, only that env is sent: a batch's arrays may change their length. Bodies that an env
     lacks (NaN) are left out the same way. The number of triangles limits a browser, so the shapes are finer

@@ -55,7 +55,8 @@ def group_visuals(geometry: SceneGeometry) -> tuple[VisualGroup, ...]:
 
 
 def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budget: int) -> int:
-    """The maximum number of triangles per visual with which all instances together stay within the budget, at least 200.
+    """The largest number of triangles per visual with which all shown instances together stay within the
+    budget; at least 200, even if that exceeds the budget.
 
     Simple shapes keep all triangles; only shapes with many triangles are reduced.
     """

@@ -99,8 +99,8 @@ class InSoftware:
         """The style to draw with: `looks`, or a cheaper one whose shapes differ by about a pixel in the open
         pages.
 
-        Shapes are simplified in the background, and used when they are ready. They stay unchanged if the user chose a finer
-        level of detail than the default, or if the view has few triangles.
+        Simplified shapes are made in the background, and used when they are ready. Shapes are not simplified
+        if the user chose a finer level of detail than the default, or if the view has few triangles.
 
         Args:
             looks: The style that the user has chosen.

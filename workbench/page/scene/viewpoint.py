@@ -122,7 +122,7 @@ class Framing:
         self._left: dict[Hashable, dict[int, tuple[NDArray, NDArray]]] = {}
         """Position and look-at of pages on which the user had moved the view, by framed object and client id."""
         self._came_back: frozenset[int] = frozenset()
-        """Pages that returned to the viewpoint that they had when they left the framed object."""
+        """Client ids of pages that returned to the viewpoint that they had on the framed object before."""
 
     def is_new(self, what: Hashable) -> bool:
         """Whether `what` differs from the object of the last call, so that it must be framed. Pages on which
@@ -160,7 +160,7 @@ class Framing:
 
     @property
     def pointed(self) -> frozenset[int]:
-        """The open pages that were pointed at the scene."""
+        """Client ids of the open pages that were pointed at the scene."""
         return frozenset(self._pointed)
 
     def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:

@@ -68,10 +68,9 @@ def displacements(
 class SentPoses:
     """The poses of bodies that were last sent to the pages.
 
-    A pose is sent again only when the last sent pose is more than a pixel off, and it is rounded to a
-    fraction of a pixel. viser sends a whole batch when one pose of it changes; as most values then equal
-    previous ones, compression makes the message small (`door.client_connection`). Bodies at rest are sent
-    exactly.
+    A pose is sent again, rounded to a fraction of a pixel, only when the last sent pose is more than a pixel
+    off. viser sends a whole batch when one pose of it changes; as most values then equal previous ones,
+    compression makes the message small (`door.client_connection`). A body at rest gets its exact pose.
 
     Args:
         reach: (R,) radius of each body around its frame, metres.

@@ -37,10 +37,10 @@ LinkTo = Callable[[str | None, int | None], EditorLink]
 
 
 def parse_editor(text: str) -> str:
-    """The address template for ``--editor``: that of a name in `EDITORS`, or the text itself.
+    """The address template for a value of ``--editor``, which is a name in `EDITORS` or itself a template.
 
     Raises:
-        ValueError: the text is neither.
+        ValueError: `text` is neither such a name nor a template that opens an editor.
     """
     if text in EDITORS:
         return EDITORS[text]

@@ -53,7 +53,7 @@ class Field:
             given: the command's other fields, for each input in the row.
             enter: command for Enter; by default Enter leaves the field.
             lines: more than one for a larger box, in which Enter begins a new line.
-            step: for a number: what an arrow key adds.
+            step: for a number: the change per press of an arrow key.
             options: for a choice: values of the field by their label.
         """
         self._names = [".".join([look, name_of(kind), field, *map(str, one.values())]) for one in given]

@@ -42,8 +42,8 @@ class DepthRange:
 def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
     """The range of most finite positive depths; None if there are none.
 
-    From the 1st to the 98th percentile, and at most to three times the median: in a range up to a floor's
-    horizon, the whole table in front would have one colour.
+    It goes from the 1st to the 98th percentile, but at most to three times the median: in a range up to a
+    floor's horizon, the whole table in front would have one colour.
     """
     met = depth[np.isfinite(depth) & (depth > 0)]
     if not met.size:
@@ -121,7 +121,8 @@ def data_address(pixels: NDArray[np.uint8], longest: int) -> str:
 
     Args:
         pixels: (H, W, 3) RGB.
-        longest: Maximum pixels of the longer side; a larger picture is downsampled by averaging. 128 takes 3 to 6 kB.
+        longest: Maximum pixels of the longer side; a larger picture is downsampled by averaging. A picture
+            with a side of 128 takes 3 to 6 kB.
     """
     image = Image.fromarray(np.ascontiguousarray(pixels))
     if max(image.size) > longest:

@@ -71,7 +71,7 @@ class LineChart:
         at: float | None = None,
         span: Span | None = None,
     ) -> None:
-        """Draw lines; hide the chart if no line has a finite value, or K < 2.
+        """Draw lines; hide the chart if no line has a finite value, or if there are fewer than two steps.
 
         Args:
             title: Title above the chart.
@@ -161,8 +161,8 @@ def ticks(low: float, high: float, most: int = MAX_TICKS) -> list[float]:
 
 
 def part_round(count: int, place: int | None) -> slice:
-    """The slice of at most `MAX_POINTS` of `count` points: around the index `place`, or, if it is None, the
-    newest."""
+    """The slice of at most `MAX_POINTS` of `count` points: around the index `place`, or the newest points if
+    `place` is None."""
     end = count if place is None else min(max(place + MAX_POINTS // 2, MAX_POINTS), count)
     return slice(max(0, end - MAX_POINTS), end)
 

@@ -21,12 +21,13 @@ class OpenTabs:
         return frozenset(one.client.client_id for one in here if self._open.get(one.name) == name)
 
     def may_show(self, name: str) -> bool:
-        """Whether a page has this tab open, or has not reported yet which it has open."""
+        """Whether some page has this tab open, or has not yet reported its open tab. Also True while there
+        are no pages."""
         here = self._visitors.all()
         return not here or any(self._open.get(one.name, name) == name for one in here)
 
     def shows(self, where: ShownOn, name: str) -> bool:
-        """Whether to draw in the view what belongs to this tab, if the user chose to show it `where`."""
+        """Whether to draw the things of this tab in the view, given the user's choice `where`."""
         return where == "on all tabs" or (where == "on this tab" and bool(self.pages_at(name)))
 
     def open(self, visitor: Visitor, name: str, fold: str = "") -> None:

@@ -20,7 +20,7 @@ BEFORE_FOLD_VALUE = " \N{MIDDLE DOT} "
 
 HIDDEN_SECONDS = 2.0
 """Minimum interval of drawings, in seconds, of a part that no page shows. The part is still drawn, so that it
-does not open empty or long out of date."""
+is neither empty nor long out of date when a page opens it."""
 
 
 class PagePart(Generic[View]):
@@ -74,14 +74,14 @@ class DrawThrottle:
         """Key, urgent value and time of the last drawing."""
 
     def drawn(self, key: object, urgent: object = None) -> None:
-        """Store this as drawn."""
+        """Record a drawing with this key and this urgent value."""
         self._drawn = key, urgent, self._clock()
 
     def is_due(self, key: object, urgent: object = None, hidden: bool = False) -> bool:
-        """Whether to draw now; if so, store this as drawn.
+        """Whether to draw now; if so, this records the drawing as `drawn` does.
 
         Args:
-            hidden: Whether no page shows it: then nothing is urgent, and the minimum interval is
+            hidden: Whether no page shows the thing: then nothing is urgent, and the minimum interval is
                 `HIDDEN_SECONDS`.
         """
         if self._drawn is not None:

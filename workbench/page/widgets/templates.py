@@ -17,10 +17,10 @@ from workbench.page.command import Command
 def render(template: str, **values: Any) -> str:
     """Render ``web_assets/panels/<template>.html`` with these values, all escaped.
 
-    viser inserts the text of ``add_html`` into the page unchanged: an exception message with a ``<script>`` would run
-    there. So all text for ``add_html`` is rendered here. Invisible characters are replaced by visible ones: a character
-    that changes the writing direction makes one name look like another. A lone surrogate, as in a file name that is not
-    UTF-8, cannot be sent to a page at all.
+    viser inserts the text of ``add_html`` into the page unchanged: a ``<script>`` in an exception message
+    would run there. So all text for ``add_html`` is rendered here. Invisible characters are replaced by
+    visible ones: a character that changes the writing direction makes one name look like another. A lone
+    surrogate, as in a file name that is not UTF-8, cannot be sent to a page at all.
     """
     return _environment().get_template(f"{template}.html").render(**values)
 
@@ -100,7 +100,7 @@ def _environment() -> jinja2.Environment:
         finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
-        auto_reload=False,  # with it every drawing would stat the template's file
+        auto_reload=False,  # with True, every drawing would stat the template's file
     )
     filters = (place, size, percent, counted, rate_text, short_text, letter, colour, asks)
     environment.filters.update({filter.__name__: filter for filter in filters})

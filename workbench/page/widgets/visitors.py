@@ -89,7 +89,8 @@ class Visitors:
         server.on_client_disconnect(self._left)
 
     async def _came(self, client: viser.ClientHandle) -> None:
-        # A random name: viser numbers its clients from 0 at each start, and gives a new number to one that reconnects.
+        # A random name instead of viser's client number: viser counts from 0 again at each start, and a
+        # client that reconnects gets a new number.
         visitor = Visitor(secrets.token_urlsafe(12), client)
         self._by_name[visitor.name] = self._by_client[client.client_id] = visitor
         client.gui.add_html(render("page_name", name=visitor.name))
