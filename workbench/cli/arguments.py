@@ -30,7 +30,7 @@ Rules = Annotated[
         choices=DEGREES,
     ),
 ]
-"""Degree of all rules. None leaves each rule its own degree; it cannot be given on the command line."""
+"""Degree of all rules. None, which cannot be given on the command line, keeps each rule's own degree."""
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
@@ -119,7 +119,7 @@ class EnvArguments:
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
 
     def options(self) -> TaskOptions:
-        """Convert to options. Raises ValueError with a message that names the argument, as all functions here do."""
+        """Convert to options. Raises ValueError with a message that names the argument."""
         return _options(self.num_envs, self.backend, self.rules, self.imports, self.seed, self.env)
 
 
@@ -222,7 +222,7 @@ def plan_options(plan: PlanArguments) -> PlanOptions:
 
 
 def separated(names: Sequence[str]) -> tuple[str, ...]:
-    """The names given to an option that is repeated, or has several names separated by commas."""
+    """Split the values of a repeatable option into names, at commas and white space."""
     return tuple(name for one in names for name in one.replace(",", " ").split())
 
 
@@ -249,7 +249,8 @@ def _env_argument(pair: str) -> tuple[str, Any]:
 
 
 def history_bytes(text: str) -> int:
-    """Bytes of ``--history``: ``256MB``, ``1.5 GB`` or a plain number. Raises ValueError."""
+    """Parse ``--history``: ``256MB``, ``1.5 GB`` or a plain number of bytes. Returns bytes. Raises
+    ValueError."""
     from workbench.live.process.memory_limit import size_in_bytes
 
     size = size_in_bytes(text)

@@ -62,7 +62,7 @@ printed first, and the rules on the lines below."""
 
 @dataclass(frozen=True)
 class CheckOutput:
-    """What a check writes besides its text, or prints in place of it."""
+    """Files that a check writes, what it prints (text or JSON), and when it fails."""
 
     json: bool = False
     """Print JSON instead of text."""
@@ -80,7 +80,7 @@ def check_in_terminal(
 
     Args:
         began: when the command began, by ``time.monotonic()``.
-        run: where the work runs; None for as many processes as cores and chunks allow.
+        run: where the work runs; None for one process per core, but not more processes than chunks.
     """
     run = run or JobArguments()
     here, root = CurrentFolder(), Path.cwd()  # a task may change the current folder
@@ -166,8 +166,7 @@ def write_reports(said: Reported, output: CheckOutput) -> None:
 
 
 def exit_code(said: Reported) -> int:
-    """Exit code of a check: 2 if nothing was checked, 1 if a finding has a degree at which the check
-    fails."""
+    """Exit code of a check: 2 if nothing was checked, 1 if the check fails (`CheckReport.fails`), else 0."""
     if said.error is not None:
         return Exit.REFUSED
     return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE

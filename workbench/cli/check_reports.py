@@ -37,7 +37,7 @@ _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 
 @dataclass(frozen=True)
 class Reported:
-    """A report with the paths and options that its texts need."""
+    """A report, with the paths and options that are needed to print it or write it to files."""
 
     report: CheckReport
     what: CheckOptions
@@ -284,7 +284,7 @@ def as_sarif(said: Reported) -> str:
         }
         for finding, reason in silenced
     ]
-    # Undecided rules are notifications: code scanning would show a result as an alert.
+    # Undecided rules become notifications, because code scanning shows each result as an alert.
     notes = [
         {
             "level": "note" if one.problem is None else "error",

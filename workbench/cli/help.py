@@ -34,8 +34,8 @@ def show_help(name: str) -> int:
     if not out.is_terminal:
         out.print(page, width=width)
         return Exit.DONE
-    # With these options, less exits at once if the text fits the window, and keeps colours. The user's own
-    # LESS takes precedence.
+    # With these options, less exits at once if the text fits the window, and keeps colours. A LESS variable
+    # that the user has set takes precedence.
     os.environ.setdefault("LESS", "FRX")
     with out.pager(styles=shutil.which("less") is not None):
         out.print(page, width=width)
@@ -74,7 +74,8 @@ def _not_found(name: str) -> str:
 
 
 def for_terminal(topic: Topic) -> str:
-    """Text of the topic without pictures; a link to another topic names the command that shows it."""
+    """Text of the topic without pictures. Each link to another topic is followed by the command that shows
+    that topic."""
 
     def link(match: re.Match[str]) -> str:
         path, _ = topic.link(match[2])

@@ -369,7 +369,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # ``workbench open --help | head``
         code = end_quietly()
     except ImportError:
-        # The cause may be an installed package that is too old: it lacks names that we import from it.
+        # The cause may be an installed package that is too old to have the names that we import from it.
         from workbench.machine.versions import unmet_lines
 
         if (unmet := unmet_lines()) is None:

@@ -79,7 +79,8 @@ def merge_in_terminal(files: Sequence[Path], job: Path | None, out: Path | None,
 
 
 def _require_known(merged: JobParts, output: MergeOutput) -> None:
-    """Raise JobFileError for a command that does not exist or a file that the command does not write."""
+    """Raise JobFileError if merge does not support the command, or if a file is requested that the command
+    does not write."""
     if merged.command not in _WRITES:
         raise JobFileError(
             f"{merged.files[0]} comes from workbench {merged.command}, which merge does not support"

@@ -47,8 +47,8 @@ class Exit(IntEnum):
 class SafeConsole(Console):
     """A rich console that removes escape sequences from printed text, and keeps its own colours, bars and cursor moves.
 
-    Text comes from file names, recordings, the author's code and requests. `machine.text` filters the output of libraries,
-    loggers and tracebacks that bypass this console.
+    Escape sequences may come from file names, recordings, the author's code and requests. The output of
+    libraries, loggers and tracebacks bypasses this console; `machine.text` filters it.
     """
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
@@ -194,7 +194,7 @@ def print_finding(finding: Finding) -> None:
 
 
 def print_event(event: Event) -> None:
-    """Print loads and failures; the page shows them too."""
+    """Print loads, failures and broken rules; the page shows them too."""
     from workbench.live.messages import Loaded, RulesBroken, TaskFailed
 
     if isinstance(event, Loaded):
@@ -244,7 +244,7 @@ def print_line(line: PrintedLine) -> None:
 
 
 MAX_QUESTIONS = 20
-"""Maximum number of questions that are listed if they cannot be asked."""
+"""Maximum number of questions that are listed if there is no terminal to ask them in."""
 _TAB = "\t"
 _SHOW = ("s", "show")
 _ANSWERS = {

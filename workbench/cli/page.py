@@ -53,7 +53,7 @@ def open_in_terminal(
     editor: str = "",
     pictures: ShownPictures = "auto",
 ) -> int:
-    """Serve the page of a task. Returns only if the server cannot start: the exit code.
+    """Serve the page of a task until the process ends. Returns an exit code if the server cannot start.
 
     Args:
         trust: whether code that recordings name runs without a question.
@@ -98,7 +98,8 @@ def start_in_terminal(
     trust: bool = False,
     editor: str = "",
 ) -> int:
-    """Serve the page to choose a task from. Returns only if the server cannot start: the exit code.
+    """Serve the page to choose a task from, until the process ends. Returns an exit code if the server cannot
+    start.
 
     Args:
         options: options of the tasks that are opened from the page.
@@ -125,7 +126,8 @@ def review_in_terminal(
     trust: bool = False,
     editor: str = "",
 ) -> int:
-    """Serve the page of a folder of recordings. Returns only if the server cannot start: the exit code.
+    """Serve the page of a folder of recordings until the process ends. Returns an exit code if the server
+    cannot start.
 
     Args:
         worker, base: options of tasks that are opened from the page.
@@ -172,7 +174,8 @@ class _HowToOpen:
         kept: KeptWork | None = None,
         on_event: Callable[[Event], None] = print_event,
     ) -> Session:
-        """Open a session of a task that a person chose; adds the task to the recent ones once it runs."""
+        """Open a session of a task that a person chose; adds the task to the recent tasks once it is
+        loaded."""
         noted: list[TaskOptions] = []
 
         def on_event_and_note(event: Event) -> None:

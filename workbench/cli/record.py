@@ -67,7 +67,7 @@ class RecordBar:
             doing: text of the bar while episodes run.
             first_seed: seed of the first episode if actions are planned. A planned control step takes long,
                 so the bar then shows the current step of each seed.
-            named: name of an episode by its number, if there is no first seed.
+            named: returns the name of an episode; called only if `first_seed` is None.
         """
         self._doing, self._first_seed, self._named = doing, first_seed, named
         self._bar, self._row = bar, bar.add_task("opening", total=total)

@@ -55,7 +55,7 @@ from workbench.task.reference import RecordedTask, TaskName, named_file
 from workbench.trust.clearance import Clearances, NotCleared, NotTrusted
 
 _MAX_LISTED = 30
-"""Number of recordings up to which the table lists all. If there are more, it omits the unchanged ones."""
+"""If there are more recordings than this, the table omits the unchanged ones."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class RescoreOptions:
 
 @dataclass(frozen=True)
 class RescoreOutput:
-    """What the command writes besides the table as text, or prints in place of it."""
+    """Files that the command writes, and what it prints: text, CSV or JSON."""
 
     csv: bool = False
     """Print CSV instead of text."""
@@ -113,8 +113,8 @@ def rescore_all(
     Args:
         on_progress: called with the number of rescored episodes, the number of all episodes, and the number
             of control steps so far.
-        clearances: decides for the code named in recordings whether it may run; with None nobody is asked, and every
-            answer is no.
+        clearances: decides whether the code named in recordings may run; None refuses all code for which the
+            user would have to be asked.
         on_notice: called before the tasks are opened, with a sentence for each module next to a task's file
             that cannot be imported because a library has the same name.
         run: where the work runs; the verdicts do not depend on it.
@@ -122,7 +122,7 @@ def rescore_all(
     Raises:
         NotTrusted: a recording names code that is not trusted, and asking is impossible or every answer was no.
         FileNotFoundError, UnreadableRecording: there is nothing to rescore.
-        TaskError: each of the tasks either cannot be opened or raises. If only some of them do so, their
+        TaskError: no task could be opened and run without an exception. If only some tasks fail, their
             verdicts contain the errors.
         CannotEnterRecording: like TaskError, for recorded source code that cannot be opened.
         PoolError: as `rescore_recordings` does.
@@ -243,8 +243,8 @@ def _require_success(
 
 
 def _cleared(groups: list[RescoreGroup], clearances: Clearances) -> list[TaskName | NotCleared]:
-    """Task to open for each group, decided before any of them runs. If asking is impossible, one refused task
-    ends the command."""
+    """Decide which task to open for each group, before any task runs. Raises NotTrusted if no task may run,
+    or if the user would have to be asked and cannot be."""
     cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
     refused = [one.question for one in not_cleared if one.question is not None]

@@ -62,7 +62,7 @@ _COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "ru
 
 @dataclass(frozen=True)
 class SolveOutput:
-    """What the command writes besides its text, or prints in place of it."""
+    """Files that the command writes, what it prints (text, JSON or CSV), and when it fails."""
 
     json: bool = False
     """Print JSON instead of text."""
@@ -75,8 +75,8 @@ class SolveOutput:
     """Lowest degree of a broken rule that makes the exit code 1."""
 
     def fails(self, report: SolveReport) -> bool:
-        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on`, or no seed was
-        solved. Always False if `fail_on` is ``never``."""
+        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on` or a higher one, or no
+        seed was solved. Always False if `fail_on` is ``never``."""
         if self.fail_on == "never":
             return False
         return not report.solved or any(self.fails_by(verdict) for verdict in report.verdicts)

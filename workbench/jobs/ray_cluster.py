@@ -1,9 +1,9 @@
 """Runs a job's work on a Ray cluster: a running one, or one that is started on this machine.
 
 A worker is a Ray actor that runs the same function as a local process. It sends its messages, packed by
-`wire`, to another actor, the broker. The process that deals the chunks polls the broker. So a worker never
-blocks, and the dealing process never loads a pickle that the author's code may have made. When Ray reports
-that a worker has ended, the worker's chunk is dealt again.
+`wire`, to another actor, the broker. The process that deals the chunks polls the broker. So sending a message
+never blocks a worker, and the dealing process never loads a pickle that the author's code may have made. When
+Ray reports that a worker has ended, the worker's chunk is dealt again.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ class _ActorPool:
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
         """Call `act` for a worker. If `act` raises an error that ends the job, kill this worker and stop the
-        others. Returns `failure` if it is not None; otherwise the error of `act`, or None."""
+        others. Returns `failure` if it is not None, else the error of `act` (None if it raised none)."""
         try:
             act()
         except (TaskError, PoolError) as error:

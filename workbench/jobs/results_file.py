@@ -118,8 +118,8 @@ class JobFile:
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None)
         try:
             with _named(path):
-                # Lock the file while it is open: otherwise two processes with one job would both do all
-                # items.
+                # Lock the file while it is open: without a lock, two processes with the same job file would
+                # both run all items.
                 self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
                 self._database.execute("BEGIN EXCLUSIVE")
                 if not self._database.execute("PRAGMA schema_version").fetchone()[0]:

@@ -36,8 +36,8 @@ class PoolError(RuntimeError):
 class Chunk:
     """Items that one worker runs together.
 
-    The division into chunks does not depend on the number of workers. So neither do the results, although the
-    outputs of a policy differ in the last bits with the batch size and with the row in the batch.
+    The division into chunks is the same for any number of workers. So the results are the same too, although
+    the outputs of a policy depend, in the last bits, on the batch size and on the row in the batch.
     """
 
     numbers: tuple[int, ...]
@@ -188,13 +188,13 @@ class Scheduler(Generic[Result, Update]):
     # --- before it begins ------------------------------------------------------------------------------
 
     def take_part(self, shard: Shard) -> None:
-        """Leave only the chunks of this part."""
+        """Keep only the chunks of this part."""
         total = sum(1 for _ in self._chunks())
         part = shard.part(total)
         self._left = islice(self._chunks(), part.start, part.stop)
 
     def go_on(self, known: Mapping[int, Result], keep: Callable[[int, Result], None]) -> None:
-        """Take the results of an earlier run of the job, and leave only the items that have no result.
+        """Take the results of an earlier run of the job; only items without a result are dealt.
 
         Args:
             keep: called with each new result before anything else uses it.
@@ -286,10 +286,10 @@ class Scheduler(Generic[Result, Update]):
             self._give_up_group(last, error, error.problem)
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
-        """Handle the death of a worker without a message.
+        """Handle the death of a worker that sent no last message.
 
         Args:
-            how: predicate of a sentence whose subject is the worker's name.
+            how: what happened to the worker, as a predicate: ``was killed by SIGKILL``.
             code: exit code of the worker, if known; deaths with the same code are of the same kind.
 
         Raises:
@@ -396,7 +396,8 @@ class Work(Generic[Setup, Result, Update]):
     """What each worker of a job does, and the files that it needs."""
 
     run: Callable[[Setup, ItemQueue], None]
-    """A function that can be imported by name. It returns when its queue has no next chunk and none is running.
+    """A function that can be imported by name. It returns when its queue has no next chunk and all items that
+    it began are finished.
 
     If it raises a TaskError, its last chunk has failed; an OSError, ValueError or RuntimeError ends the job.
     """

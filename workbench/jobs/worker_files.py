@@ -22,7 +22,7 @@ Value = TypeVar("Value")
 
 
 class TooMuch(ValueError):
-    """The files exceed the maximum size; the message names the largest."""
+    """The files exceed the maximum size; the message names the largest files."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def pack_worker_files(folders: Iterable[Path], files: Iterable[Path] = ()) -> Wo
 
     Args:
         folders: folders with everything below, except hidden files, virtual environments and recordings.
-        files: other files, packed without their folders.
+        files: other files, packed without the rest of their folders.
 
     Raises:
         TooMuch: the files are together larger than `MAX_BYTES`.

@@ -34,12 +34,13 @@ _MAX_FOLDERS = 64
 """Maximum number of subfolders that are searched for jobs."""
 
 SCAN_SECONDS = 1.0
-"""Interval of checks of the folders' times."""
+"""Interval at which the modification times of all folders are checked."""
 MAX_PAUSE_SECONDS = 5.0
 FULL_SCAN_SECONDS = 30.0
-"""Interval of checks of every file: writing a file in place does not change its folder's time."""
+"""Interval at which every file is checked: writing a file in place does not change its folder's modification
+time."""
 PUBLISH_SECONDS = 0.3
-"""Interval of updates of the table while files are being read."""
+"""Interval at which the table is updated while files are being read."""
 
 
 class LibraryError(OSError):
@@ -160,8 +161,8 @@ class Library:
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._scan_requested.clear()
-            # Pause for nine times as long as the scan took, within limits: a huge folder that is written to
-            # all the time would keep the thread busy.
+            # Pause for nine times as long as the scan took, within limits: without a pause, a huge folder
+            # that is written to all the time would keep the thread busy.
             self._scan_requested.wait(
                 min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), MAX_PAUSE_SECONDS)
             )
@@ -200,7 +201,7 @@ class Library:
             gone = {key for key in self._kept if key not in scan.found and (only is None or key in only)}
             for key in gone:
                 del self._kept[key]
-            # After an incomplete scan a missing file may still exist: the index keeps it.
+            # After an incomplete scan a missing file may still exist: the index keeps its rows.
             forgotten = [] if scan.problem else sorted(gone)
         changed.sort(key=lambda found: found.newest, reverse=True)
         unsaved: list[tuple[RecordingFiles, list[LibraryEntry]]] = []
@@ -280,7 +281,7 @@ class Library:
         )
 
     def set_note(self, ids: Iterable[str], note: str) -> None:
-        """Set the note of recordings; an empty one removes it. Raises like `set_tags`."""
+        """Set the note of recordings; an empty text removes the note. Raises like `set_tags`."""
         note = clean_note(note)
         self._annotate(ids, lambda facts: (facts.tags, note))
 

@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class IndexedFiles:
-    """The rows of the files of one recording name, with the files' sizes and times when they were read."""
+    """The rows of the files that share one name, with the files' sizes and times when they were read."""
 
     found: RecordingFiles
     rows: tuple[Facts, ...]

@@ -137,8 +137,8 @@ class LibraryPanel(PagePart[object]):
         self._pictured: tuple[LibraryRow, ...] = ()
         """Rows whose thumbnails are being read or were read last."""
         self._thumbnails: Mapping[str, bytes | None] = {}
-        """JPEGs by row id; None for a recording without one. A row that is missing here has not been read
-        yet."""
+        """JPEGs by row id; None for a recording without a JPEG. An id is missing until its thumbnail is
+        read."""
         library.on_change.add(self._library_changed)
         self._library_changed()
 
@@ -147,7 +147,8 @@ class LibraryPanel(PagePart[object]):
         self._drawn: object = None
         self._jobs_drawn: object = None
         self._filters_drawn: object = None
-        """Key of the data for which the filters were counted: with thousands of rows, counting takes long."""
+        """Key of the data for which the rows of each filter were counted; counting thousands of rows takes
+        long."""
         self._table_drawn: object = None
 
     # --- interface for the page ------------------------------------------------------------------------

@@ -24,7 +24,7 @@ class AptFailed(RuntimeError):
 class PackageVersion:
     version: str
     suite: str
-    """Release as for apt's ``-t``: ``bookworm-backports``."""
+    """Name of the release, as apt's option ``-t`` takes it: ``bookworm-backports``."""
 
 
 def has_apt() -> bool:
@@ -178,9 +178,9 @@ def backports_source(sources: list[AptSource], codename: str) -> str | None:
     """A deb822 source for ``CODENAME-backports`` on the mirror of ``CODENAME`` itself; None if no source has
     ``CODENAME``'s ``main``.
 
-    The same mirror is used, since the machine may reach no other. Its trust options (``Signed-By``,
-    ``Trusted``) are copied, since apt would refuse the source without them. Adding backports upgrades
-    nothing: their Release file has ``NotAutomatic``.
+    The same mirror is used, since the machine may reach no other. The trust options of its source
+    (``Signed-By``, ``Trusted``) are copied, since apt would refuse the new source without them. The new
+    source upgrades no package: the Release file of backports has ``NotAutomatic``.
     """
     for source in sources:
         if codename in source.suites and "main" in source.components:

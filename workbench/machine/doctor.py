@@ -72,8 +72,9 @@ class _TookTooLong(Exception):
 def diagnose() -> list[DoctorFinding]:
     """Run all checks. Never raises: a check that fails becomes a finding with its error.
 
-    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are probed in child processes with a
-    timeout. PhysX's GPU library is only searched for on the disk, since SAPIEN would download it.
+    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are probed in child
+    processes with a timeout. PhysX's GPU library is only looked up on the disk, since SAPIEN would download a
+    missing one.
     """
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
@@ -158,8 +159,8 @@ def _packages() -> list[DoctorFinding]:
 
 
 def _maniskill() -> list[DoctorFinding]:
-    """Check which ManiSkill is installed (the release, a nightly build, or both, which overwrite each other's
-    files), and that ManiSkill and the related packages have the private names that the workbench uses."""
+    """Check which ManiSkill is installed: the release, a nightly build, or both (they overwrite each other's
+    files). Check that ManiSkill and the related packages have the private names that the workbench uses."""
     topic = "ManiSkill"
     if (lacking := lines_if_lacking("A task")) is not None:
         return [DoctorFinding(topic, False, *lacking)]
@@ -312,7 +313,7 @@ def _page_address() -> list[DoctorFinding]:
         f"http://127.0.0.1:{DEFAULT_PORT}/ and a token that `workbench open` prints; from elsewhere: {tunnel}"
     )
     with socket.socket() as trial:
-        # As a server does: with this option, a port with lingering connections counts as free.
+        # Servers set this option too: with it, a port whose closed connections linger counts as free.
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind(("127.0.0.1", DEFAULT_PORT))

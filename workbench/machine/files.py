@@ -62,7 +62,7 @@ def give_name(temporary: Path, path: Path) -> None:
 
 
 def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
-    """Write a new file; returns False, and changes nothing, if it exists. Raises OSError."""
+    """Write a new file; returns False, and changes nothing, if `path` exists. Raises OSError."""
     with written_beside(path, content, mode) as temporary:
         try:
             give_name(temporary, path)
@@ -72,8 +72,8 @@ def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
 
 
 def real_path(path: Path) -> Path:
-    """The absolute path with links resolved. If links form a cycle, the path stays as it is; ``Path.resolve``
-    would raise RuntimeError before Python 3.13."""
+    """The absolute path with links resolved. Links that form a cycle stay unresolved; before Python 3.13,
+    ``Path.resolve`` would raise RuntimeError for them."""
     return Path(os.path.realpath(path))
 
 
@@ -126,8 +126,7 @@ def new_file(path: Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
     finally:
-        # If `path` exists by now, a failed removal does no harm. If not, it must not hide the error of the
-        # block.
+        # An error of this removal must not hide the error of the block.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
@@ -136,7 +135,7 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError as error:
-        # Another type, since `new_file` takes a FileExistsError to mean that its own file exists.
+        # Raise another type, since `new_file` concludes from a FileExistsError that the file to make exists.
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
 
 
@@ -197,8 +196,8 @@ def open_regular_file(path: str | os.PathLike[str], most_bytes: int | None = Non
     """Open a regular file for reading without blocking; links are followed.
 
     Args:
-        most_bytes: maximum size; None for any. A file that grows afterwards, or one in ``/proc``, which has no size, may
-            contain more.
+        most_bytes: maximum size when the file is opened; None for any. More bytes can be read if the file
+            grows afterwards, or is in ``/proc``, where files state size 0.
 
     Raises:
         NotARegularFile, FileTooLarge, OSError: as `read_regular_file`.

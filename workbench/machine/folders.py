@@ -18,7 +18,7 @@ MAX_FILE_BYTES = 16 << 20
 
 
 class NoUserFolder(OSError):
-    """The folder is missing or not private; the message is the end of a sentence."""
+    """The folder is missing or not private; the message is a clause without a full stop."""
 
 
 def user_folder() -> Path:
@@ -63,7 +63,8 @@ def read_private(name: str, folder: Path | None = None) -> bytes | None:
         folder: folder of the file; None for `user_folder`.
 
     Raises:
-        NoUserFolder: the folder or the file belongs to another user, or others may write to it.
+        NoUserFolder: the folder or the file belongs to another user, others may write to it, or the file is
+            not a regular file of at most `MAX_FILE_BYTES`.
         OSError: the file cannot be read.
     """
     path = (folder or user_folder()) / name

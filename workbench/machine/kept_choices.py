@@ -16,14 +16,14 @@ log = logging.getLogger(__name__)
 
 
 class KeptChoices(msgspec.Struct, frozen=True):
-    """The file's content. A field that a later version adds has a default."""
+    """Content of `FILE`. Every field has a default, so that files of earlier versions can be read."""
 
     hints_closed: bool = False
     """Whether the hints of the first page were closed."""
     check_after_save: bool = True
     """Whether rules are checked after each load."""
     policies: dict[str, list[str]] = {}
-    """By the folder in which the command was started: the policies that were used, newest first."""
+    """Policies that were used, newest first, by the folder in which the command was started."""
 
 
 def kept_choices() -> KeptChoices:

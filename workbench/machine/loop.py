@@ -1,9 +1,10 @@
 """The asyncio loop on whose thread all state of sessions changes.
 
-Requests of pages, events of workers and results of jobs are *changes*, which run one after the other, each to its end. So the
-state needs no lock, and every read sees one moment. Nothing may block the loop: blocking calls (a disk, another process) are
-awaited, or run in a `BlockingPool`. Commands that serve pages run the loop in the main thread (`loop_in_main`); elsewhere a
-daemon thread runs it, from the first use until the process ends.
+Requests of pages, events of workers and results of jobs are *changes*, which run one after the other, each to
+its end. So the state needs no lock, and no reader sees a half-made change. Nothing may block the loop:
+blocking calls (a disk, another process) are awaited, or run in a `BlockingPool`. Commands that serve pages
+run the loop in the main thread (`loop_in_main`); elsewhere a daemon thread runs it, from the first use until
+the process ends.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def loop_in_main(command: Callable[Args, Value]) -> Callable[Args, Value]:
     command.
 
     Raises:
-        KeyboardInterrupt: on Ctrl-C, until the command calls `on_signal`. The command's thread is left behind.
+        KeyboardInterrupt: on Ctrl-C, until the command calls `on_signal`. The command's thread keeps running.
     """
 
     @functools.wraps(command)
@@ -133,7 +134,7 @@ def on_loop(method: Callable[Args, Value]) -> Callable[Args, Value]:
 
 
 def begin(work: Coroutine[Any, Any, Value]) -> asyncio.Task[Value]:
-    """Start a coroutine on the loop. Call it on the loop."""
+    """Start a coroutine on the loop. Must be called on the loop's thread."""
     task = _loop().create_task(work)
     _tasks.add(task)  # asyncio itself holds tasks weakly
     task.add_done_callback(_tasks.discard)
@@ -141,7 +142,8 @@ def begin(work: Coroutine[Any, Any, Value]) -> asyncio.Task[Value]:
 
 
 def later(seconds: float, change: Callable[[], object]) -> asyncio.TimerHandle:
-    """Schedule a change after `seconds`; the returned handle cancels it. Call it on the loop."""
+    """Schedule a change after `seconds`; the returned handle cancels it. Must be called on the loop's
+    thread."""
     return _loop().call_later(seconds, change)
 
 
@@ -151,7 +153,7 @@ def submit(work: Coroutine[Any, Any, Value]) -> futures.Future[Value]:
 
 
 def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lambda: None) -> Value:
-    """Run a coroutine on the loop and wait for its result. Call it on another thread than the loop.
+    """Run a coroutine on the loop and wait for its result. Must not be called on the loop's thread.
 
     Args:
         check: polled while waiting; its exception cancels the work, and is raised.
@@ -189,7 +191,7 @@ class ChangeCounter:
             self._changed.notify_all()
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Block until the count differs from `seen`; returns the count."""
+        """Block until the count differs from `seen`, at most `timeout` seconds; returns the count."""
         with self._changed:
             self._changed.wait_for(lambda: self.count != seen or self._closing, timeout)
             return self.count
@@ -214,8 +216,8 @@ class BlockingPool:
         self._ended = False
 
     def begin(self, work: Callable[[], Value]) -> futures.Future[Value]:
-        """Queue `work` behind earlier work. After `end`, the returned future is already cancelled. Call it on
-        the loop."""
+        """Queue `work` behind earlier work. After `end`, the returned future is already cancelled. Must be
+        called on the loop's thread."""
         made: futures.Future[Value] = futures.Future()
         if self._ended:
             made.cancel()
@@ -236,8 +238,8 @@ class BlockingPool:
         self._work.put(None)
 
     def close(self, within: float | None = None) -> None:
-        """End the thread when all queued work is done, and wait for that up to `within` seconds (None: for ever). Call it on
-        another thread than the loop."""
+        """End the thread when all queued work is done, and wait for that up to `within` seconds (None: for
+        ever). Must not be called on the loop's thread."""
         self.end()
         if self._thread is not None:
             self._thread.join(within)

@@ -27,7 +27,7 @@ def lacks_maniskill() -> bool:
 
 
 def installed_maniskills() -> dict[str, str]:
-    """Installed version by distribution. Also empty for a clone of ManiSkill that is only on the path."""
+    """Installed versions of ManiSkill, by distribution. A clone that is only on the path does not count."""
     found = {}
     for name in EXTRAS:
         try:
@@ -41,7 +41,8 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
     """Two lines if ManiSkill is not installed: that `what` needs it, and the command to type. None if it is installed.
 
     Args:
-        arguments: arguments of the ``workbench`` command, as typed; None if it was not started by the command.
+        arguments: arguments of the ``workbench`` command, as typed; None if this process was not started by
+            that command.
     """
     if not lacks_maniskill():
         return None
@@ -99,7 +100,7 @@ def pip_command(verb: str, *requirements: str) -> str:
 
 
 def _requirement(name: str) -> str:
-    """The requirement in the workbench's own metadata for this distribution's extra; the bare name where the
+    """Name and versions of this distribution as the workbench's metadata require them; only the name if the
     workbench is not installed."""
     try:
         lines = importlib.metadata.requires(DISTRIBUTION) or []

@@ -192,7 +192,7 @@ def mesa_version(debian_version: str) -> tuple[int, int]:
 
 
 def first_good_mesa(versions: list[PackageVersion]) -> PackageVersion | None:
-    """The newest of apt's versions that SAPIEN renders on."""
+    """The newest of these versions that SAPIEN renders on; None if there is none."""
     return next((version for version in versions if mesa_version(version.version) >= OLDEST_MESA), None)
 
 

@@ -180,7 +180,7 @@ class _OneLine(logging.Formatter):
         return plain_text(super().formatMessage(record))
 
     def formatException(self, ei: Any) -> str:
-        # An error's text may be as long as what a recording or a page sent.
+        # An error message may quote all that a recording or a page sent.
         lines = [line[:MAX_LINE_CHARACTERS] for line in super().formatException(ei).splitlines()]
         if len(lines) > MAX_TRACEBACK_LINES:
             lines = [*lines[: MAX_TRACEBACK_LINES // 2], "    ...", *lines[-MAX_TRACEBACK_LINES // 2 :]]

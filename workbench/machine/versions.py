@@ -78,7 +78,8 @@ def stored_names(code: CodeType, of: str | None = None) -> set[str]:
     """Attributes that a function and its inner functions assign: on any object or, if `of` is given, only on
     the variable with this name.
 
-    Read from the bytecode: `dis` and sources would take a third of a second for ManiSkill's BaseEnv, at each start.
+    Reads the raw bytecode, because `dis` or the source text would take a third of a second for ManiSkill's
+    BaseEnv, at each start.
     """
     found: set[str] = set()
     for each in _codes(code):
@@ -97,7 +98,7 @@ def stored_names(code: CodeType, of: str | None = None) -> set[str]:
 
 
 _CACHE = dis.opmap.get("CACHE", 0)
-"""Opcode that fills the space after an instruction."""
+"""Opcode of the cache entries that follow an instruction."""
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
@@ -180,7 +181,7 @@ def untested_text() -> str:
 
 
 def moved_text(moved: Iterable[PrivateName]) -> str:
-    """Features that do not work, each with the names that have moved; empty if none has."""
+    """Features that do not work, each with the names that have moved; empty if no name has moved."""
     lacking: dict[str, list[str]] = {}
     for each in moved:
         lacking.setdefault(each.disables or "opening a task", []).append(each.dotted)

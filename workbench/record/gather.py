@@ -89,7 +89,7 @@ class GatheredEpisode:
     def set_placed(
         self, placed: Mapping[CameraKey, CameraSettings], in_file: Mapping[CameraKey, CameraSettings] = {}
     ) -> None:
-        """From the next state on, these cameras are placed by hand. Raises RecordingError.
+        """Record that these cameras are placed by hand from the next state on. Raises RecordingError.
 
         Args:
             in_file: settings in the recorded source, for cameras whose settings in the task's description differ.
@@ -130,8 +130,8 @@ class EpisodeGatherer:
     then decides whether its files are made (`EpisodeWriter.finish` takes a fraction of a second, and may run
     on another thread).
 
-    The gatherer checks that `elapsed_steps` counts 0, 1, 2 ...: after a lost step, or a reset that it did not
-    see, the recording would be wrong without any sign of it.
+    The gatherer checks that `elapsed_steps` counts 0, 1, 2 ...: after a lost step or an unseen reset, the
+    recording would be wrong without any sign.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class EpisodeGatherer:
 
         Raises:
             ValueError: the step does not follow the previous one, or has values that files cannot represent;
-                `finish` still makes the files of the states so far.
+                `finish` can still write the states before that step.
             RecordingError: the step cannot be written.
         """
         step = stepped.step
@@ -350,8 +350,8 @@ class EpisodeFinisher:
     """Writes the files of finished episodes one by one on a thread. Thread-safe.
 
     There is only one thread, because two would compete for the GIL: even at the end, when nothing else needs
-    the GIL, two threads take a quarter longer (measured). A subprocess does not compete for the GIL. If there
-    is a subprocess, `close` also makes files, on the thread that calls it.
+    the GIL, two threads take a quarter longer than one (measured). A subprocess does not compete for the GIL.
+    If there is a subprocess, `close` also makes files, on the thread that calls it.
     """
 
     def __init__(

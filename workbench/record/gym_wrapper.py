@@ -37,8 +37,8 @@ from workbench.task.open import describe
 
 logger = logging.getLogger(__name__)
 _MAX_PENDING_STEPS = 2048
-"""Maximum number of pending steps, summed over the envs; together they take 3 MB. They are gathered earlier
-if half a second has passed or an episode begins."""
+"""Maximum number of pending steps, summed over the envs; together they take 3 MB. Steps are gathered earlier
+when an episode begins, and before each write of the journals."""
 _MAX_PENDING_PICTURE_BYTES = 1 << 25
 """Maximum size of the pictures that wait for the gatherer."""
 

@@ -68,7 +68,7 @@ class RecordOptions(RecordArguments):
     workers: int = 1
     """Number of processes that record, if no executor is given. This number does not change the episodes."""
     source: dict[str, str] = field(default_factory=dict)
-    """Text by path that replaces the task's files on disk."""
+    """Texts that are used instead of the task's files on disk, by path."""
 
 
 @dataclass(frozen=True)
@@ -262,8 +262,7 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
         for finding in findings_of_shaders(opened.description.cameras):
             queue.send_update(RecordUpdate(finding=finding))
     if isinstance(opened.env.env, BatchedCpuMixin):
-        # Otherwise the last bits of an episode's numbers would depend on earlier episodes of the same
-        # process.
+        # Without this, the last bits of an episode's numbers depend on earlier episodes of the same process.
         opened.env.env.begins_anew = True
     return opened
 

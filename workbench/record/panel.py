@@ -72,7 +72,7 @@ class RecordPanel(MomentPart):
         self._record.content = tools_html([Tool(record, ToggleRecording(), hint, off=off, tone="main")])
         self._which.show(recording.chosen, off=not can_record)
         self._which.visible = view.task is None or view.task.num_envs > 1
-        # Disabled instead of left out: otherwise the next button would move under the pointer.
+        # Disable the button, and do not hide it: without it, the next button would move under the pointer.
         following = tool(NEXT, RecordNextEpisode(), off=not can_record or recording.active)
         save = Tool(
             STOP_SAVING if saving else SAVE,

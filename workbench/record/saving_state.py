@@ -54,8 +54,8 @@ class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset.
 
     If the env jumped back, the moments up to the restored one are followed by those after the jump. The last
-    moment is the one at which the env terminated or was truncated; without such a moment, it is the last one
-    before the next reset or jump, or the newest one if the episode still runs.
+    moment is the one at which the env terminated or was truncated. If there is none, it is the moment before
+    the next reset or jump; in a running episode, it is the newest moment.
     """
 
     env: int

@@ -92,7 +92,7 @@ class RescoreSetup:
     """Recordings of a job, and the codes that rescore them."""
 
     codes: tuple[RescoredBy | None, ...]
-    """Codes that rescore; None for recordings that are skipped."""
+    """Code of each group of recordings; None for a group that is skipped."""
     of_chunk: tuple[int, ...]
     """Index in `codes` for each chunk."""
     items: Mapping[int, Recording]
@@ -224,8 +224,8 @@ class _Stopped(Exception):
 
 
 def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
-    """Rescore the chunks of one worker. If the author's code raises, the exception becomes the verdict of the
-    chunk's recordings that have none yet."""
+    """Rescore the chunks of one worker. If the author's code raises, the exception becomes the verdict of
+    those recordings of the chunk that have no verdict yet."""
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # a task may change the working directory
     chunk = queue.next()

@@ -118,8 +118,8 @@ def hidden_modules_text(reference: TaskName) -> list[str]:
 
 
 def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
-    """Options of the same env without pictures, which take most of the time and are not read by rewards; and a note on
-    the change."""
+    """Options of the same env without pictures, and a note on the change. Pictures take most of the time, and
+    rewards do not read them."""
     kwargs, note = dict(options.env_kwargs), ""
     mode = kwargs.get("obs_mode")
     if mode is not None and mode not in ("state", "state_dict", "none"):
@@ -153,7 +153,8 @@ MAX_VERSIONS = 3
 class Rescorer:
     """Rescores recordings in a separate process, one task after the other.
 
-    The process ends with the job, so that code of recordings does not stay loaded; stopping the job kills it.
+    The process ends with the job, so that code of recordings does not stay loaded; stopping the job kills the
+    process.
     """
 
     def __init__(self, clearances: Clearances | None = None, base: TaskOptions | None = None) -> None:
@@ -303,8 +304,8 @@ class Rescorer:
 
 
 def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
-    """Enter `recorded_source` on `stack`; returns the reference to open. This process writes and removes the
-    text: so it is removed even if the background process is killed. Raises CannotEnterRecording."""
+    """Enter `recorded_source` on `stack`; returns the reference to open. The text is written and removed by
+    this process, so it is removed even if the background process is killed. Raises CannotEnterRecording."""
     reference = stack.enter_context(recorded_source(info))
     if job.stopped:
         stack.close()

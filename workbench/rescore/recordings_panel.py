@@ -103,7 +103,7 @@ class RescoreChoices:
 
 
 def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
-    """The sources of these recordings, without those that are deleted or cannot be read."""
+    """The sources of these recordings, without those that are no longer in the library."""
     rows = {row.id: row for row in library.view().rows}
     return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
 

@@ -42,7 +42,7 @@ class RescoreView:
     steps: int = 0
     """Number of control steps that were rescored so far."""
     seconds: float = 0.0
-    """Duration of these steps in seconds, without loading."""
+    """Time in seconds that rescoring took so far, without loading."""
     task: str = ""
     """Name of the code that rescores."""
     stopped_by: StoppedBy | None = None

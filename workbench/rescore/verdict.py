@@ -29,7 +29,7 @@ class Scores:
     """Reward of a run, and the entries of evaluate that are scalars or flags."""
 
     reward: NDArray
-    """(T,); empty if none was recorded."""
+    """(T,) rewards; empty if none was recorded."""
     evaluate: Mapping[str, NDArray]
     """(T + 1,) values of each entry; NaN in states without the entry."""
     has_reward: bool = True
@@ -241,8 +241,9 @@ class Rescored:
 
 @dataclass(frozen=True)
 class Rescore(Question[Rescored]):
-    """Open a task in a worker that has no open task, and rescore these episodes with it. The first part is
-    sent when the task is open; the answer contains only results that were not sent as parts."""
+    """Open a task in a worker that has no open task, and rescore these episodes with it. All results are sent
+    as parts. The first part is empty and is sent when the task is open; the answer contains only the
+    exception of the code, if it raised."""
 
     part: ClassVar[Any] = Rescored
     task: TaskName

@@ -40,7 +40,7 @@ def change_text(verdict: Verdict[Any]) -> str:
 
 
 def _flag_text(name: str, was: int | None, now: int | None) -> str:
-    """Text of the first steps at which a flag was true, in the record and now; None for never."""
+    """Text of the first steps at which a flag was true, in the record and now (None: never)."""
     before = "never" if was is None else f"at step {was}"
     return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
 

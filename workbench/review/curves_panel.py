@@ -111,7 +111,7 @@ class ReviewCurves(PagePart[ReviewView]):
                 self._wish = curve
 
     def _offer(self, view: ReviewView, shown: Sequence[int]) -> str:
-        """Offer the entries of the shown recordings as choices. Returns the chosen one; empty if there is
+        """Offer the entries of the shown recordings as choices. Returns the chosen entry; empty if there is
         none."""
         found = [self._found[view.opened[index].id] for index in shown]
         self._offered = {

@@ -131,8 +131,8 @@ def source_changes(
     pairs = {name: (before.get(name, ""), after.get(name, "")) for name in dict.fromkeys([*before, *after])}
     gone, new_ones = next(iter(before), None), next(iter(after), None)
     if gone is not None and new_ones is not None and gone not in after and new_ones not in before:
-        # The task's own file comes first in both. If it was renamed, compare the old file with the new one:
-        # otherwise, all its lines would count as changed.
+        # The task's own file comes first in both. If it was renamed, compare the old file with the new one,
+        # or all its lines would count as changed.
         del pairs[gone], pairs[new_ones]
         pairs = {f"{gone} → {new_ones}": (before[gone], after[new_ones]), **pairs}
     for name, (old, new) in pairs.items():
@@ -184,7 +184,7 @@ def distances(a: NDArray, b: NDArray) -> NDArray[np.float64]:
 
 
 def _steps(a: NDArray, b: NDArray, rows: tuple[slice, slice]) -> tuple[NDArray, NDArray]:
-    """Values of steps at the states of `rows`: NaN at the first state, to which no step led."""
+    """Values of steps at the states of `rows`; NaN at state 0 of a recording, to which no step led."""
     padded = [np.concatenate([np.full((1, *x.shape[1:]), np.nan), np.asarray(x, np.float64)]) for x in (a, b)]
     return padded[0][rows[0]], padded[1][rows[1]]
 

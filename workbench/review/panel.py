@@ -43,7 +43,8 @@ GO_LIVE_HINT = "Restores the shown state in the live env, with the current code"
 
 
 class ReviewPanel(PagePart[ReviewView]):
-    """The controls in the present container; those for comparisons are shown only while several recordings are open.
+    """The controls in the current container; those for comparisons are shown only while several recordings
+    are open.
 
     Args:
         server: The page.
@@ -152,7 +153,7 @@ class ReviewPanel(PagePart[ReviewView]):
 
 
 def unaligned_text(view: ReviewView) -> str:
-    """The note on recordings without the event that they are aligned at."""
+    """The note on open recordings that lack the event at which all are aligned; empty if none lacks it."""
     name = view.align.removeprefix("first ")
     without = [letter(i) for i, one in enumerate(view.opened) if one.first(name) is None]
     if view.align == "start" or not without:

@@ -147,7 +147,7 @@ class Review:
         post(self._list)
 
     def add_problem(self, sentence: str) -> None:
-        """Show this among the problems until something is opened."""
+        """Show this sentence among the problems until something is opened."""
         post(lambda: self._happened(ProblemFound(sentence)))
 
     @on_loop

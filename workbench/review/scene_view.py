@@ -65,7 +65,7 @@ class ReviewScene:
 
     def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
         """(N, B, 7) poses of each recording at its state in `states`; NaN for bodies that a recording lacks,
-        and for bodies of a ghost that are where the first recording's are."""
+        and for a ghost's bodies that are at the same place as in the first recording."""
         found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
         if self.ghosts:
             for ghost in found[1:]:
@@ -344,7 +344,7 @@ def solid_recording(view: ReviewView, scene: ReviewScene) -> int:
 
 
 def human_camera(view: ReviewView) -> CameraTrack | None:
-    """The human camera of the selected recording; if it has none, of another one."""
+    """The human camera of the selected recording; if it has none, that of another open recording, or None."""
     chosen = view.chosen
     several = () if chosen is None else (chosen, *view.opened)
     tracks = (track for one in several for track in one.episode.cameras)

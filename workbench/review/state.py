@@ -374,7 +374,8 @@ def _moved(state: ReviewState, position: int, now: float) -> ReviewState:
 
 
 def _to_event(state: ReviewState, direction: int, now: float) -> ReviewState:
-    """Go to the next (1) or previous (-1) event of any open recording; of the selected one if many are open."""
+    """Go to the next (1) or previous (-1) event, or to the last position. Events of all open recordings
+    count; if more than `MAX_OVERLAID` are open, only those of the selected one."""
     view = state.view
     if not view.opened:
         return state

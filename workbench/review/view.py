@@ -134,7 +134,8 @@ class ReviewView:
 
 
 def state_at(position: int, anchor: int, length: int) -> int:
-    """State of an episode with `length` steps at a position; beyond its ends its first or last state."""
+    """State of an episode with `length` steps at a position: before the episode the first state, after it the
+    last."""
     return min(max(position + anchor, 0), length)
 
 

@@ -42,10 +42,11 @@ def child_environment(**further: str) -> dict[str, str]:
 def start_with_socket(
     module: str, environment: dict[str, str], new_session: bool = False
 ) -> tuple[subprocess.Popen[bytes], socket.socket]:
-    """Start ``python -m MODULE SOCKET`` without output; returns the process and the other end of the socket, which keeps
-    message boundaries.
+    """Start ``python -m MODULE SOCKET`` without output; returns the process and the end of the socket that
+    stays here. The socket keeps message boundaries.
 
-    Ctrl-C in the terminal does not reach the child, because this process still needs it. Raises OSError.
+    Ctrl-C in the terminal does not reach the child, because this process still needs the child. Raises
+    OSError.
 
     Args:
         new_session: start the child in its own session, not only in its own process group.

@@ -28,8 +28,8 @@ _PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MAX_WRITTEN_BYTES = 1 << 20
-"""Maximum size of a file that a process confined without `writes` writes; this limit also holds without
-Landlock."""
+"""Maximum size of a file that a process can write if `confine` was called without `writes`; enforced even
+without Landlock."""
 MAX_OPEN_FILES = 512
 
 

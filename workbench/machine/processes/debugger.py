@@ -39,7 +39,7 @@ def listen_for_debugger(port: int, hold: Callable[[bool], None]) -> None:
     except ImportError as error:
         raise CannotDebug(f"debugpy cannot be imported: {error}") from error
     _report_suspension(pydevd.PyDB, hold)
-    # Otherwise, each process that a task starts would wait for its own debugger.
+    # Without this, each process that a task starts would wait for its own debugger.
     debugpy.configure(subProcess=False)
     try:
         debugpy.listen((HOST, port))
@@ -77,7 +77,8 @@ def debug_here(on_message: Callable[[str], None]) -> None:
 
 
 def _report_suspension(debugger: Any, hold: Callable[[bool], None]) -> None:
-    """Call `hold` around debugpy's one method in which a thread is suspended; debugpy has no event for it.
+    """Wrap the one method in which debugpy suspends threads, to call `hold`; debugpy has no event for
+    suspensions.
 
     Without this, the supervisor would treat a worker at a breakpoint as hanging.
     """
@@ -165,8 +166,8 @@ class NoDebugger(RuntimeError):
 def refuse_breakpoints(advice: str) -> None:
     """Make ``breakpoint()`` and ``pdb.set_trace()`` raise `NoDebugger` at their own line, in this process.
 
-    Python's debugger would read the end of its input and raise a bare ``BdbQuit`` at the next line. A ``PYTHONBREAKPOINT``
-    that names another function, or 0, stays in effect.
+    Python's debugger would read the end of its input and raise a bare ``BdbQuit`` at the next line.
+    ``PYTHONBREAKPOINT`` stays in effect if it is 0 or names another function than ``pdb.set_trace``.
 
     Args:
         advice: what to do instead, appended after a colon.

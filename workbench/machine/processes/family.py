@@ -128,9 +128,9 @@ def begin_family(server: int) -> None:
     A task may start processes that leave the worker's group (``setsid``) or its process tree (double fork).
     They cannot be found once the worker is gone. The keeper is their *subreaper*: a process below the keeper
     that loses its parent becomes a child of the keeper. When the worker has ended, the server is gone, or the
-    server asks for it (SIGTERM), the keeper kills its children until it has none, and exits with the worker's
-    status. It kills nothing else, since a child's process id is not reused before its parent has waited for
-    it. A cgroup would need rights that a container or an ssh login does not have.
+    server sends SIGTERM, the keeper kills its children until it has none, and exits with the worker's status.
+    It kills nothing else, since a child's process id is not reused before its parent has waited for it. A
+    cgroup would need rights that a container or an ssh login does not have.
 
     Call it before any import (the keeper then takes 6 MB) and before any thread is started.
 
@@ -138,8 +138,8 @@ def begin_family(server: int) -> None:
         server: process id of the parent. The keeper ends its family when the parent is gone.
     """
     libc = ctypes.CDLL(None)
-    # These signals are blocked until `_keep` waits for them: otherwise, SIGCHLD is lost, and SIGTERM ends the
-    # keeper before the worker.
+    # Block these signals until `_keep` waits for them. Without this, a SIGCHLD before that would be lost, and
+    # a SIGTERM would end the keeper before the worker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     signal.signal(
         signal.SIGCHLD, signal.SIG_DFL
@@ -152,11 +152,13 @@ def begin_family(server: int) -> None:
     worker = os.fork()
     if worker != 0:
         _keep(worker)
-    # A new group: signals of the author's code to its group must not reach the keeper. But no new session: Linux shares the
-    # cores among sessions first (autogroups), so background work could not leave them to another worker.
+    # A new group: signals of the author's code to its group must not reach the keeper. But no new session:
+    # Linux shares the cores among sessions first (autogroups), so background work in its own session could
+    # not leave the cores to another worker.
     os.setpgid(0, 0)
     for number in (signal.SIGTTIN, signal.SIGTTOU):
-        # Otherwise, code that uses the terminal, which belongs to the server's group, is stopped for ever.
+        # Without this, code that uses the terminal, which belongs to the server's group, would be stopped for
+        # ever.
         signal.signal(number, signal.SIG_IGN)
     end_with_parent(keeper)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -189,8 +191,8 @@ class Keeper(Protocol):
 
 
 def end_family(keeper: Keeper) -> None:
-    """End a process that called `begin_family` and all that it started; returns when the process has ended.
-    If it does not react, it is killed, and processes that detached themselves may stay."""
+    """End a process that called `begin_family` and all that it started; returns when the process has ended. A
+    process that does not react is killed; then, processes that detached themselves may keep running."""
     keeper.terminate()
     try:
         keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)

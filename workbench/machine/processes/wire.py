@@ -28,7 +28,7 @@ copied behind their length, so that one call sends both."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
 """msgpack extensions: `_ARRAY` stands for the next of the arrays behind the message; `_AGAIN` contains the
-number of an array that the message has had before."""
+number of an earlier array of the same message, which occurs again."""
 _ARRAY_KINDS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
 _MAX_DESCRIPTION_BYTES = 500
@@ -89,9 +89,9 @@ def has_come(end: socket.socket, seconds: float | None = 0.0) -> bool:
 class MessageSocket:
     """One end of a socket for messages. One thread may receive while another sends; any thread may call `waits`.
 
-    The author's code runs in the worker: it may write anything into the socket, and end in the middle of a message. So
-    received bytes are either data of the expected types or `Unreadable`. A message is msgpack decoded by type, never a
-    pickle:
+    The author's code runs in the worker: it may write anything into the socket, or end the worker in the
+    middle of a message. So received bytes become data of the expected types, or raise `Unreadable`. A message
+    is msgpack decoded by type, never a pickle:
 
         4 bytes    length of all that follows; framed as `multiprocessing.connection.Connection` does it
         4 bytes    length of the message
@@ -191,7 +191,7 @@ def pack(value: object) -> bytes:
 
 
 def pack_message(message: object) -> bytes:
-    """Encode a request or an event; a `Call` is sent under the name of its question."""
+    """Encode a request or an event; a `Call` is encoded under the class name of its question."""
     if isinstance(message, Call):
         return pack((type(message.request).__name__, message.number, message.request))
     return pack((type(message).__name__, None, message))
@@ -272,7 +272,8 @@ class _Written:
         self.parts: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._alive: list[np.ndarray] = []
-        """Arrays that are kept alive, since `_numbers` has their ids."""
+        """Arrays that are kept alive, because Python could reuse their ids, which are the keys of
+        `_numbers`."""
 
     def hook(self, value: object) -> object:
         if isinstance(value, np.ndarray):
