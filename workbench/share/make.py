@@ -86,13 +86,13 @@ class Made:
     damaged: tuple[str, ...] = ()
     """A sentence for each damaged file of a recording whose other files were used."""
     incomplete: tuple[str, ...] = ()
-    """A sentence for each recording that lacks a part of the request."""
+    """For ManiSkill's demonstrations: a sentence for each recording that lacks some of its observations."""
     sizes: tuple[int, ...] = ()
     """Size of each file in bytes, for downloads."""
 
     @property
     def said(self) -> tuple[str, ...]:
-        """Sentences that the page shows."""
+        """The first `MAX_SENTENCES` sentences about recordings, and how many more there are."""
         said = (*self.damaged, *self.left_out, *self.incomplete)
         more = len(said) - MAX_SENTENCES
         return said[:MAX_SENTENCES] + ((f"And {more} more.",) if more > 0 else ())
@@ -102,14 +102,14 @@ OnProgress = Callable[[float, str], None]
 
 
 def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None) -> Made:
-    """Carry out a request for each recording that has the data. Used by the page and the command line.
+    """Make the requested files from each recording that has the data. Used by the page and the command line.
 
     Args:
         on_progress: called with the completed share, 0 to 1, and the current work.
 
     Raises:
         UnreadableRecording: a recording is damaged, and nothing can be made.
-        ValueError: no recording has the data; the message says for each recording what is missing.
+        ValueError: no recording has the data; the message says what each recording lacks.
         OSError: a file cannot be written; the message contains the reason. Finished files stay.
         RuntimeError: this machine cannot render.
     """
@@ -155,7 +155,7 @@ def file_name(what: What, source: str, camera: str = "") -> str:
 
 @contextlib.contextmanager
 def _reading() -> Iterator[None]:
-    """Raise an OSError of the block as an error of the recording, not of the output disk."""
+    """Raise an OSError of the block as `UnreadableRecording`: the block only reads a recording."""
     try:
         yield
     except OSError as error:
@@ -271,7 +271,7 @@ def _files_of(source: Source) -> list[Path]:
 
 
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
-    """Progress callback of one of several recordings."""
+    """Progress callback for part `number` of `count` equal parts of the work."""
     return lambda done, doing: on_progress((number + done) / count, doing)
 
 
@@ -293,7 +293,8 @@ def _counted(
 
 END_SECONDS = 5.0
 PROGRESS_PERIOD_SECONDS = 0.1
-"""Interval of progress messages. For a sheet of pictures, a message per frame would cost more than the frame."""
+"""Minimum time between two progress messages. For a sheet of pictures, a message per frame would cost more
+than the frame."""
 
 
 @dataclass(frozen=True)
@@ -313,8 +314,8 @@ class MakingView:
 class Making:
     """Carries out one request at a time, in a separate process.
 
-    Encoding a film uses a core for a while, and drawing a scene needs a renderer that the server's process must not import,
-    since a crash in a driver would end the page. A stopped job leaves no files.
+    Encoding a film uses a core for a while. Drawing a scene needs a renderer, which the server's process must
+    not import: a crash in the driver would end the page. A stopped job leaves no files.
     """
 
     def __init__(self) -> None:
@@ -333,7 +334,7 @@ class Making:
         """Start a job; returns False if one is already running.
 
         Args:
-            download: write into a new temporary folder, which `close` deletes, not into `wanted.folder`.
+            download: write into a new temporary folder instead of `wanted.folder`; `close` deletes it.
         """
         if self._view.running:
             return False
@@ -347,7 +348,7 @@ class Making:
         self._stopped = True
 
     def close(self) -> None:
-        """Stop, wait for the end of the process, and delete the downloads. Called on another thread than the loop."""
+        """Stop, wait for the end of the process, and delete the downloads. Must not be called on the loop."""
         self.stop()
         if self._task is not None:
             # A process that hangs is ended together with this process, by `machine.processes.family`.
@@ -392,7 +393,7 @@ class Making:
 
 
 class _Stopped(BaseException):
-    """Unwinds the blocks that delete half-written files."""
+    """Stops the job: raised so that the open ``with`` blocks delete half-written files."""
 
 
 def _make(wanted: MakeRequest, queue: ItemQueue) -> None:

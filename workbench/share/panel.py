@@ -97,7 +97,7 @@ class ShareChoices:
 
 
 class SharePanel:
-    """The controls in the present container.
+    """The controls for sharing, in the present container.
 
     Args:
         server: The page.
@@ -145,7 +145,7 @@ class SharePanel:
         """Whether to share the open recordings instead of the selected ones.
 
         Args:
-            both: whether there are open recordings, and other ones are selected.
+            both: whether some recordings are open and different ones are selected.
         """
         self._shared.visible = both
         return both and self._choices.opened
@@ -242,8 +242,8 @@ class SharePanel:
 def will_make(
     what: What, chosen: Chosen, camera: str, folder: Path, only_successes: bool = False
 ) -> dict[str, Any]:
-    """Preview of a press on *Make*, as far as known before the recordings are read: a description, the files with their short
-    names, their folder ``where`` (empty for downloads), and a note."""
+    """What *Make* would write, as far as known before the recordings are read: ``what`` (a description),
+    ``files`` (names and short names), ``where`` (the path of a dataset; empty for downloads) and ``note``."""
     names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what in DATASETS:

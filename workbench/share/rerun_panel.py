@@ -55,10 +55,9 @@ class RerunPages:
     The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows
     the host (behind ``ssh -L`` it differs). So the browser first opens a small page of ours, which builds the
     addresses and redirects to rerun. The address cannot contain the step: rerun accepts a step only for
-    recordings of its own servers.
-    So a script of ours in rerun's page sends the step (``viewer_control``, rerun 0.41: one hand-written
-    protobuf message) when the recording has been read. A version of rerun without that message opens at the
-    first step.
+    recordings of its own servers. So a script of ours in rerun's page sends the step (``viewer_control``,
+    rerun 0.41: one hand-written protobuf message) when the recording has been read. A version of rerun
+    without that message opens at the first step.
     """
 
     def __init__(self, gated_server: GatedServer, offers: Downloads) -> None:
@@ -76,8 +75,8 @@ class RerunPages:
         """The address, from the root of the server, that opens these ``.rrd`` files together.
 
         Args:
-            moments: called when the address is opened; returns the initial step of each recording that does not start at the
-                first.
+            moments: called when the address is opened; returns the step at which each recording opens. A
+                recording without an entry opens at its first step.
         """
         paths = tuple(Path(path).absolute() for path in recordings)
         # The key is the same for the same files, and cannot be guessed.
@@ -123,7 +122,7 @@ def _viewer_file(name: str, query: Mapping[str, str]) -> tuple[int, str, bytes] 
 
 
 class RerunView:
-    """Buttons in the present container that open recordings in rerun, and the panel that shows it.
+    """Buttons in the present container that open recordings in rerun, and the panel that shows rerun.
 
     Args:
         server: The page.
@@ -250,6 +249,6 @@ class RerunView:
 
     @on_loop
     def end(self) -> None:
-        """Cancel an opening of rerun. Called when the page is removed, together with the panel."""
+        """Cancel an opening of rerun. Called when the page is removed; the panel is removed with it."""
         self._jobs.close()
         self._panel = None

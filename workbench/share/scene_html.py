@@ -86,7 +86,7 @@ def _recorded(
     assert geometry is not None and poses is not None
     env = 0 if geometry.num_envs == 1 else episode.info.env_index
     server.scene.set_up_direction("+z")
-    # Use viser's own lights: its player resets to them at every repetition, so others would flash.
+    # Use viser's own lights: its player resets to them at every repetition, so other lights would flash.
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
     camera.near, camera.far = 0.05, 300.0

@@ -101,7 +101,7 @@ class Catalogue:
         recordings: folder of recordings.
         recents: recently opened tasks.
         registered: ManiSkill's tasks.
-        options: options of tasks without their own.
+        options: options of rows without options of their own.
     """
 
     def __init__(

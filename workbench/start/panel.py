@@ -77,7 +77,7 @@ class Search:
 
     words: str = ""
     typed: Entry | None = None
-    """The file, if the words are its path."""
+    """The row of the file whose path the words are; None for other words."""
     why_not: str = ""
     """Why the path in the words cannot be opened."""
 

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 LIST_FILE = "tasks.json"
 MAX_TASKS = 2000
 MAX_TRIES = 2
-"""Number of attempts to draw a task before `RETRY_SECONDS` has to pass."""
+"""Number of failed attempts to draw a task; each later attempt has to wait `RETRY_SECONDS`."""
 RETRY_SECONDS = 7 * 24 * 3600.0
 """Backoff after `MAX_TRIES` failures: missing files may have been downloaded by then."""
 ANSWER_SECONDS = 120.0
@@ -79,7 +79,7 @@ class RegisteredView:
     why_not: Mapping[str, NotDrawn] = field(default_factory=dict)
     """Why a task has no picture, by id."""
     doing: str = ""
-    """``listing the tasks``, ``drawing PickCube-v1``; empty if there is no work."""
+    """The work in progress, such as ``drawing PickCube-v1``; empty if there is none."""
     problem: str = ""
     """Why there is no list, or why no more pictures are made, as sentences."""
 
@@ -123,7 +123,7 @@ class RegisteredTasks:
         return _read_jpeg(self._file(env_id)) if env_id in self.view.pictures else None
 
     def close(self) -> None:
-        """End the process. Called on another thread than the loop."""
+        """End the process. Must not be called on the loop."""
         do(self._end)
         self._process.close()
 

@@ -20,10 +20,11 @@ class NotAPath(ValueError):
 
 
 def typed_path(text: str, folder: Path) -> tuple[Path, str | None] | None:
-    """File and class that a text names; None for a text that does not have the form of a path, such as search words.
+    """File and class that a path or a ``module:Class`` names; the class is None if the path has none. Returns
+    None for other texts, such as search words, and for a module that is not found.
 
-    Accepts the forms of terminals, editors and file managers: surrounding quotes and spaces, ``file://``, ``~``, a line
-    number at the end.
+    Accepts paths as terminals, editors and file managers write them: with surrounding quotes and spaces,
+    ``file://``, ``~``, or a line number at the end.
 
     Args:
         folder: base of a relative path.

@@ -130,7 +130,7 @@ class SweepReport:
 
 
 def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
-    """The recording of each point, with the modified text of the task's file. Does not run the file.
+    """The options for recording each point, with the modified text of the task's file. Does not run the file.
 
     Raises:
         SettingError: a name is neither a constant of the file nor an argument of the constructor, or a value

@@ -37,7 +37,7 @@ MAX_AXES = 9
 MAX_TICKS = 8
 """Maximum number of labels of an axis."""
 MAX_CLICKABLE_LINES = 64
-"""Maximum number of lines that can be clicked."""
+"""If the plot has more lines than this, they cannot be clicked."""
 MAX_SHOWN_EPISODES = 5
 """Number of best and of worst episodes of a point that are shown."""
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
@@ -56,8 +56,8 @@ class Axis:
     heights: tuple[float | None, ...]
     """For each point of the sweep, y on this axis in pixels; None for a point without a value."""
     ticks: tuple[tuple[str, float, str], ...]
-    """Label of each tick, its y in pixels, and the setting's value in JSON; an empty text on axes of
-    results."""
+    """(label, y in pixels, value of the setting in JSON) of each tick. On axes of results the value is
+    empty."""
 
 
 def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Axis]:
@@ -157,7 +157,7 @@ def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
 
 @dataclass(frozen=True)
 class Shown:
-    """A person's choices; shared by all open pages."""
+    """The user's choices; shared by all open pages."""
 
     column: str = "success"
     descending: bool = True
@@ -199,7 +199,7 @@ class LoadedSweep:
     results: SweepResults | None = None
     problem: str = ""
     summaries: Sequence[PointSummary] = ()
-    """Summaries, best first."""
+    """One for each point, best first."""
     point_of: Mapping[str, int] = field(default_factory=dict)
     """Index of the point of each recording, by path of the recording."""
 
@@ -208,7 +208,7 @@ class SweepPanel(PagePart[ReviewView]):
     """The tab's content, in the current container.
 
     Args:
-        on_open: called with the ids of recordings in the library.
+        on_open: called with the library's ids of the recordings to open.
     """
 
     every = 0.25

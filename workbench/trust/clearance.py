@@ -1,4 +1,4 @@
-"""Decides whether code that a recording references or contains, or a listed file, may run; asks the user if necessary."""
+"""Decides whether a listed file, or code of a recording, may run; asks the user if necessary."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ class _Undecided:
 
     content: TaskContent
     agreed: bool
-    """Whether the texts may run, but later saves may not."""
+    """Whether the texts may run already, so that only later saves need a question."""
 
 
 class Clearances:
@@ -230,7 +230,9 @@ class Clearances:
     def clear_file(
         self, file: Path, class_name: str | None = None, stopped: Callable[[], bool] = lambda: False
     ) -> TaskName:
-        """The task to open for a file that the user chose from a list and that will be followed; asks like `clear`.
+        """The task to open for a file that the user chose from a list. Later saves of the file run too.
+
+        Asks the user if necessary, as `clear` does.
 
         Raises:
             NotCleared: the code must not run.

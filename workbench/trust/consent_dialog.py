@@ -1,4 +1,4 @@
-"""The dialog that asks whether code referenced by a recording may run."""
+"""The dialog that asks whether code of a recording, or a listed file, may run."""
 
 from __future__ import annotations
 
