@@ -17,6 +17,8 @@
 //   data-field='["set_seed", {}, "seed"]'    command, its other fields, and the field for the value: committed on Enter or blur, when an
 //                                            option is chosen, or (data-live) on every input; Enter sends data-enter
 //     data-number="[0, null, 1, true]"         a number: minimum, maximum, step of an arrow key, whether it is an integer
+//   data-drive='["drive_robot", "keys", ["w"]]'  while this element is in the page, these keys drive: the command's field has
+//                                            the held ones, sent when they change and every 100 ms
 //   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrow keys from it
 //                                            into the list, starting at data-best
 //   data-shows='[["text.set_seed.seed", "12", false, {}]]'  name of a data-field element; the server's value, copied into the element
@@ -292,6 +294,42 @@
   const MOVE_VIEW = /^(Key[WASDQE]|Arrow(Up|Down|Left|Right))$/; // viser 1.1, CameraControls.tsx
   document.addEventListener("keydown", (event) => MOVE_VIEW.test(event.code) && event.stopImmediatePropagation());
 
+  const BEAT = 100; // milliseconds between reports of held keys; the server lets go without them
+  const held = new Set();
+  let beat = 0;
+
+  // The physical key, so that CapsLock, Shift and another layout drive too.
+  const drivingKey = ({ code, key }) => (code.startsWith("Key") ? code.slice(3) : key).toLowerCase();
+
+  function reportHeld() {
+    const drive = document.querySelector("[data-drive]")?.dataset.drive;
+    if (!drive) held.clear();
+    else {
+      const [name, field] = JSON.parse(drive);
+      sendNewest("drive", [name, { [field]: [...held] }]);
+    }
+    if (held.size) beat ||= setInterval(reportHeld, BEAT);
+    else beat = clearInterval(beat);
+  }
+
+  function drives(event) {
+    const drive = document.querySelector("[data-drive]")?.dataset.drive;
+    const key = drivingKey(event);
+    if (!drive || event.ctrlKey || event.metaKey || event.altKey || !JSON.parse(drive)[2].includes(key)) return false;
+    if (!event.repeat) {
+      held.add(key);
+      reportHeld();
+    }
+    return true;
+  }
+
+  addEventListener("keyup", (event) => held.delete(drivingKey(event)) && reportHeld(), true);
+  addEventListener("blur", () => {
+    if (!held.size) return;
+    held.clear();
+    reportHeld();
+  });
+
   addEventListener(
     "keydown",
     (event) => {
@@ -304,6 +342,11 @@
       if (event.key === "Escape" || at.closest(TYPED)) opening = 0;
       else if (OPENS.test(nameOf(event))) opening = now + OPENING;
       else if (now < opening && !event.ctrlKey && !event.metaKey && !event.altKey) {
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        return;
+      }
+      if (!at.closest(TYPED) && !contexts().includes("dialog") && drives(event)) {
         event.preventDefault();
         event.stopImmediatePropagation();
         return;

@@ -27,6 +27,7 @@ from workbench.cameras.view import shown_cameras
 from workbench.checks.panel import TAB as CHECKS
 from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
+from workbench.hands.drive_panel import DrivePanel, DrivingSign
 from workbench.hands.panel import HandsPanel
 from workbench.live.commands import ChoosePictures
 from workbench.live.events import PagesCounted
@@ -187,6 +188,7 @@ class Page:
                 self._opening.add_button(name)
             status = StatusLine(server, clock)
             marks = Marks(server, session, self._open_tabs)
+            sign = DrivingSign(server)
             server.gui.add_html(render("help_link"))
         self._in_software = stage.in_software
         self._in_software.ask()
@@ -201,7 +203,7 @@ class Page:
         floating = self._envs, self._record, log, self._icons, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
         # The transport first: a press on Play must not wait for the table of envs.
-        self._parts = Parts((status, self._timeline, marks, *in_tabs, *floating, *opening), clock)
+        self._parts = Parts((status, self._timeline, marks, sign, *in_tabs, *floating, *opening), clock)
         for part in self._reward:
             self._parts.add(part, lambda view: self._is_shown(REWARD, view))
         self._parts.add(self._studio, lambda view: self._is_shown(CAMERAS, view))
@@ -232,6 +234,7 @@ class Page:
         with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
             self._hints = add_hints(server)
             self._run = RunPanel(server, session)
+            drive = DrivePanel(server, session)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
             self._view_panel = ViewPanel(server, dark, self._view_choice)
@@ -264,7 +267,7 @@ class Page:
             profile = StepProfilePanel(server, self._link)
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
-        of_run = self._run, version, options, self._view_panel
+        of_run = self._run, drive, version, options, self._view_panel
         return [*of_run, self._inspect, self._hands, self._solve, seeds, profile, checks]
 
     def _add_left_dock(self) -> None:

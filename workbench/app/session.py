@@ -284,6 +284,7 @@ class Session:
             state.seeds,
             state.solving.view(run.env),
             studio_view_of(state.studio, run, self._studio.progress),
+            state.hands,
         )
         return view_of(
             self._run,

@@ -59,6 +59,7 @@ DOES: frozenset[type[Command]] = (
     | of_seeds.DOES
     | of_solver.DOES
     | of_studio.DOES
+    | of_hands.DOES
 )
 """Commands that `apply` handles."""
 
@@ -83,6 +84,8 @@ class State:
     """Plans for the action source *solve*."""
     policies: of_policies.KnownPolicies = of_policies.KnownPolicies()
     """Policies to choose from, for the action source *policy*."""
+    hands: of_hands.Hands = of_hands.Hands()
+    """A person who drives the robot."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -101,8 +104,8 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     solving, for_solver = of_solver.apply(state.solving, event, run)
     policies, for_policies = of_policies.apply(state.policies, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
-    for_hands = of_hands.apply(event, run)
-    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
+    hands, for_hands = of_hands.apply(state.hands, event, run)
+    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies, hands)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
     # before the checks, so that the checks run first. Effects of the run come after the jobs: when a load is

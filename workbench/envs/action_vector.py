@@ -259,6 +259,12 @@ def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:
     return np.concatenate(columns) if columns else np.zeros(0, bool)
 
 
+def zero_holds(part: ActionPart) -> bool:
+    """Whether an action of zero leaves the joints of this controller where they are: True for deltas and
+    velocities."""
+    return bool(getattr(part.controller.config, "use_delta", True))
+
+
 def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
     controller: Any = part.controller
     count = len(part.names)

@@ -34,6 +34,19 @@ class ToggleHandles(Command, frozen=True):
     context = "live"
 
 
+class ToggleDriving(Command, frozen=True):
+    """Drive the robot of the selected env by keys, or stop driving."""
+
+    key = "k"
+    context = "live"
+
+
+class DriveRobot(Command, frozen=True):
+    """Report from the page which driving keys are held."""
+
+    keys: Annotated[tuple[str, ...], msgspec.Meta(max_length=16)]
+
+
 class ChooseMovedEnvs(Command, frozen=True):
     """Move the body in the selected env, or in all envs."""
 

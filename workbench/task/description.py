@@ -87,6 +87,8 @@ class ActionDimension:
     """For example ``arm/panda_joint1`` or ``gripper``."""
     low: float
     high: float
+    zero_holds: bool = True
+    """Whether zero leaves the robot where it is: True for deltas and velocities, False for absolute targets."""
 
 
 @dataclass(frozen=True)

@@ -289,7 +289,7 @@ def describe(
     """The task as plain data; `given` are the keyword arguments that it was made with."""
     env = task.env
     dimensions = [
-        ActionDimension(name, float(low), float(high))
+        ActionDimension(name, float(low), float(high), actions.zero_holds(part))
         for part in task.parts
         for name, low, high in zip(part.names, part.low, part.high, strict=True)
     ]

@@ -1,0 +1,119 @@
+"""Driving a robot by keys."""
+
+# A session that has a task has a step.
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.session import live_session, start_over, wait_until
+from workbench.app.session import Session
+from workbench.hands.commands import ToggleDriving
+from workbench.hands.drive_panel import quarter_turns
+from workbench.hands.driving import KEYS, PAIRS, bindings, driven_action
+from workbench.hands.state import Driven, Hands
+from workbench.live.commands import PauseRun, UseControlMode
+from workbench.page.command import Refused
+from workbench.task.description import ActionDimension
+
+ARM = tuple(ActionDimension(f"arm/{axis}", -1.0, 2.0) for axis in ("x", "y", "z", "rx", "ry", "rz"))
+PANDA = (*ARM, ActionDimension("gripper/finger", -1.0, 1.0, zero_holds=False))
+FLANGE = "panda/panda_hand"
+
+
+@given(st.sets(st.sampled_from(KEYS)), st.integers(0, 3))
+def test_values_are_within_the_bounds_and_opposite_keys_cancel(keys: set[str], turns: int) -> None:
+    dimensions, values = driven_action(PANDA, keys, turns)
+    assert dimensions == tuple(range(6))
+    assert all(PANDA[k].low <= value <= PANDA[k].high for k, value in zip(dimensions, values, strict=True))
+    both = {key for pair in PAIRS for key in pair}
+    assert not any(driven_action(PANDA, both, turns)[1])
+    assert not any(driven_action(PANDA, (), turns)[1])
+
+
+@pytest.mark.parametrize(("turns", "x", "y"), [(0, 2.0, 0.0), (1, 0.0, 2.0), (2, -1.0, 0.0), (3, 0.0, -1.0)])
+def test_w_moves_away_from_the_person(turns: int, x: float, y: float) -> None:
+    assert driven_action(PANDA, ("w",), turns)[1][:2] == (x, y)
+
+
+def test_the_view_decides_no_other_number_than_x_and_y() -> None:
+    joints = tuple(ActionDimension(f"arm/joint{k}", -1.0, 1.0) for k in range(9))
+    assert {driven_action(joints, ("w",), turns)[1] for turns in range(4)} == {(1.0, 0, 0, 0, 0, 0, 0)}
+    absolute = tuple(ActionDimension(one.name, -1.0, 1.0, zero_holds=False) for one in joints)
+    assert not bindings(absolute)
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-1.2, 1.2))
+def test_quarter_turns_are_those_of_the_camera(yaw: float, pitch: float) -> None:
+    """A camera of viser looks along its z axis, with x to the right and y down."""
+    ahead = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)])
+    right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    matrix = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    from viser.transforms import SO3
+
+    turns = quarter_turns(SO3.from_matrix(matrix).wxyz)
+    assert math.cos(yaw - turns * math.pi / 2) > math.cos(math.pi / 4 + 1e-6)
+
+
+@pytest.fixture(scope="module")
+def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    where = tmp_path_factory.mktemp("recordings")
+    with live_session("PickCube-v1", where, num_envs=2, control_mode="pd_ee_delta_pose") as session:
+        yield session
+
+
+def hand(session: Session) -> np.ndarray:
+    """(N, 3) position of each hand."""
+    view = session.view()
+    return view.step.poses[:, view.task.geometry.body_names.index(FLANGE), :3]
+
+
+def test_a_held_key_moves_the_robot_until_it_is_released_or_the_page_is_silent(session: Session) -> None:
+    session.change(action_source="random", episode_end="reset", selected_env=1)
+    session.do(PauseRun())
+    start_over(session, 0)
+    session.do(ToggleDriving())
+    view = wait_until(session, lambda v: v.playing and v.settings.action_source == "sliders", "driving")
+    assert view.of(Hands).driving and view.settings.episode_end == "continue"
+    began = hand(session)[1].copy()
+    for _ in itertools.repeat(None, 3):
+        session.happen(Driven(("w",), 0))
+        last = session.view().step_serial
+        wait_until(session, lambda v, last=last: v.step_serial > last + 2, "steps")
+    view = wait_until(session, lambda v: not v.of(Hands).keys, "the keys count as released")
+    assert hand(session)[1, 0] > began[0] + 0.03
+    wait_until(session, lambda v: v.told is not None and not v.told[1, :6].any(), "the robot holds still")
+    session.happen(Driven(("g",), 0))
+    wait_until(session, lambda v: v.told is not None and v.told[1, 6] == -1, "the gripper closes")
+    session.happen(Driven((), 0))
+    session.do(ToggleDriving())
+    view = session.view()
+    assert not view.of(Hands).driving
+    assert (view.settings.action_source, view.settings.episode_end) == ("random", "reset")
+    session.do(PauseRun())
+
+
+def test_choosing_another_source_of_actions_takes_over(session: Session) -> None:
+    session.do(ToggleDriving())
+    session.change(action_source="hold")
+    view = session.view()
+    assert not view.of(Hands).driving and view.settings.action_source == "hold"
+    session.happen(Driven(("w",), 0))
+    assert not session.view().of(Hands).keys
+    session.do(PauseRun())
+
+
+def test_a_mode_of_absolute_targets_is_refused(session: Session) -> None:
+    session.do(UseControlMode(mode="pd_joint_pos"))
+    wait_until(session, lambda v: v.task.control_mode == "pd_joint_pos" and v.state == "paused", "the mode")
+    with pytest.raises(Refused, match="pd_joint_pos"):
+        session.do(ToggleDriving())
+    assert not session.view().of(Hands).driving

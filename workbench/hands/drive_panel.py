@@ -1,0 +1,92 @@
+"""Driving by keys: the button and its keys on the Run tab, and the sign in the bar."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+
+from workbench.hands.commands import DriveRobot, ToggleDriving
+from workbench.hands.driving import GRIPPER_KEY, KEYS, Binding, bindings, gripper
+from workbench.hands.state import Driven, Hands
+from workbench.live.session_protocol import LiveSession
+from workbench.live.view import SessionView
+from workbench.page.command import Command, name_of
+from workbench.page.widgets.keys_and_palette import key_in_words, with_key
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import Tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+
+
+class DrivePanel(PagePart[SessionView]):
+    """The button *Drive by keys*, and what each key does while a person drives."""
+
+    does = (DriveRobot,)
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._session = session
+        self._html = server.gui.add_html("")
+
+    def key(self, view: SessionView) -> object:
+        return view.of(Hands).driving, view.task_serial, view.selected_env
+
+    def draw(self, view: SessionView) -> None:
+        driving = view.of(Hands).driving
+        actions = () if view.task is None else view.task.actions
+        button = Tool(
+            "Stop driving" if driving else "Drive by keys",
+            ToggleDriving(),
+            with_key(ToggleDriving),
+            on=driving,
+            off=not actions,
+        )
+        rows = _rows(bindings(actions), bool(gripper(actions))) if driving else []
+        self._html.content = tools_html([button]) + render("drive_keys", rows=rows)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case DriveRobot(keys=keys):
+                known = tuple(key for key in keys if key in KEYS)
+                self._session.happen(Driven(known, quarter_turns(visitor.client.camera.wxyz)))
+
+
+class DrivingSign(PagePart[SessionView]):
+    """The sign in the bar that a person drives; with it, the page sends the driving keys."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._html = server.gui.add_html("", visible=False)
+
+    def key(self, view: SessionView) -> object:
+        return view.of(Hands).driving, view.selected_env, view.task_serial
+
+    def draw(self, view: SessionView) -> None:
+        driving = view.of(Hands).driving and view.task is not None
+        self._html.visible = driving
+        if driving:
+            self._html.content = render(
+                "driving",
+                env=view.selected_env,
+                drives=json.dumps([name_of(DriveRobot), "keys", KEYS]),
+                stop=ToggleDriving(),
+                hint=with_key(ToggleDriving),
+            )
+
+
+def quarter_turns(wxyz: Sequence[float] | np.ndarray) -> int:
+    """Quarter turns to the left, seen from above, from the x axis to where a camera of the page looks.
+
+    Args:
+        wxyz: the camera's orientation, looking along its z axis.
+    """
+    w, x, y, z = wxyz
+    ahead = 2 * (x * z + w * y), 2 * (y * z - w * x)
+    return round(float(np.arctan2(ahead[1], ahead[0])) / (np.pi / 2)) % 4
+
+
+def _rows(bound: Sequence[Binding], has_gripper: bool) -> list[tuple[str, str]]:
+    """Keys and what they drive."""
+    rows = [(f"{key_in_words(one.raises)} / {key_in_words(one.lowers)}", one.name) for one in bound]
+    return [*rows, (key_in_words(GRIPPER_KEY), "open or close the gripper")] if has_gripper else rows

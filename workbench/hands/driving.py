@@ -1,0 +1,80 @@
+"""Maps held keys to the action of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.task.description import ActionDimension
+
+PAIRS = (
+    ("w", "s"),
+    ("a", "d"),
+    ("e", "q"),
+    ("r", "f"),
+    ("arrowup", "arrowdown"),
+    ("arrowleft", "arrowright"),
+    ("t", "y"),
+)
+"""Keys that raise and lower the numbers of the action that zero holds still, in the order of the action. For an end
+effector these are x, y, z and rotations about x, y, z."""
+GRIPPER_KEY = "g"
+KEYS = (*(key for pair in PAIRS for key in pair), GRIPPER_KEY)
+
+
+@dataclass(frozen=True)
+class Binding:
+    """The keys of one number of the action."""
+
+    dimension: int
+    name: str
+    raises: str
+    lowers: str
+    low: float
+    high: float
+
+
+def bindings(dimensions: Sequence[ActionDimension]) -> tuple[Binding, ...]:
+    """The numbers that keys drive: those that zero holds still. Empty for a mode of absolute targets."""
+    relative = [(k, one) for k, one in enumerate(dimensions) if one.zero_holds]
+    return tuple(
+        Binding(k, one.name, *keys, *_bounds(one)) for keys, (k, one) in zip(PAIRS, relative, strict=False)
+    )
+
+
+def gripper(dimensions: Sequence[ActionDimension]) -> tuple[tuple[int, float, float], ...]:
+    """Number, closed and open value of each gripper: targets of a controller that is called ``gripper``."""
+    return tuple(
+        (k, *_bounds(one))
+        for k, one in enumerate(dimensions)
+        if not one.zero_holds and "gripper" in one.name.split("/")[:-1]
+    )
+
+
+def driven_action(
+    dimensions: Sequence[ActionDimension], keys: Collection[str], turns: int
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """The numbers to set, and their values, while these keys are held.
+
+    Args:
+        turns: quarter turns to the left of the person's view, seen from above, against the x axis. With them
+            ``w`` moves an end effector away from the person.
+    """
+    bound = bindings(dimensions)
+    amounts = np.array([(one.raises in keys) - (one.lowers in keys) for one in bound], float)
+    axes = [one.name.rpartition("/")[2] for one in bound[:2]]
+    if axes == ["x", "y"]:
+        ahead, left = amounts[:2]
+        cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns % 4]
+        amounts[:2] = cos * ahead - sin * left, sin * ahead + cos * left
+    values = [
+        amount * (one.high if amount > 0 else -one.low) for amount, one in zip(amounts, bound, strict=True)
+    ]
+    return tuple(one.dimension for one in bound), tuple(map(float, values))
+
+
+def _bounds(dimension: ActionDimension) -> tuple[float, float]:
+    low, high = dimension.low, dimension.high
+    return (low if np.isfinite(low) else -1.0), (high if np.isfinite(high) else 1.0)
