@@ -46,7 +46,7 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> 
     expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     expect(page.get_by_text(re.compile("The best rollout: return"))).to_be_visible()
     save.click()
-    expect(page.get_by_text(re.compile("^saved "))).to_be_visible()
+    expect(page.get_by_text(re.compile("^saved ", re.IGNORECASE))).to_be_visible()
     desk.tab("Episodes")
     desk.button("Review recordings").click()
     expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)

@@ -44,7 +44,7 @@ RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. The list of topics omits these pages; the topic ``rules``
 lists them in a table."""
 FIRST = (
-    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
+    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "hands", "cameras", "recordings", "checks", "solve",
     "sweep", "cluster", "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics. All other topics follow, sorted by name."""

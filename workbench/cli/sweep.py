@@ -248,7 +248,10 @@ def print_points(results: SweepResults) -> None:
     out.print(table)
     if len(summaries) > _MAX_POINTS:
         print_text(f"... and {len(summaries) - _MAX_POINTS} more points")
-    print_text("success: at any step, with the 95 % confidence interval of the rate; return and terms: means")
+    print_text(
+        "success: share of episodes with success at any step, with its 95 % confidence interval; the columns return and "
+        "terms are means over the episodes"
+    )
     if fit < len(heads):
         print_text(f"More means are in {RESULTS}: {', '.join(heads[fit:])}")
 

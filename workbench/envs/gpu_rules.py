@@ -357,8 +357,8 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "refused-by-gpu",
             "warn",
             "_initialize_episode",
-            """Mass, limits, damping and drives of joints are set, and bodies are removed, while the scene is
-            built; static actors are not moved; values have a row for each env that is written.
+            """Masses, limits, damping and drives of joints are set, and bodies are removed, only while the scene
+            is built; no static actor is moved; values that are set have a row for each env that is set.
 
             The call raises.
 

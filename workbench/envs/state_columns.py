@@ -143,7 +143,7 @@ def flat_names(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str
     """Name, shape and dtype of each part of a flattened observation (N, D), or None if they are not known.
 
     ManiSkill drops the names, so the env is observed once more without flattening. That runs the author's
-    hooks, which may count or draw random numbers. So the env is observed only once per version of the task,
+    hooks, which may draw random numbers or increase a counter. So the env is observed only once per version of the task,
     and the task's memory is restored afterwards.
     """
     env = task.env

@@ -423,6 +423,8 @@ def test_a_spare_that_dies_while_warming_up_is_tried_only_once_more(
             spare.kill()
             until(lambda: spare.memory == 0, "its end")
             spare.poll()
+        # A process frees its memory before it closes its socket.
+        until(lambda: not lives() and not spare.ready, "the end of the second spare to be noticed")
         spare.begin_soon()
         assert not lives() and not spare.ready
     finally:

@@ -170,7 +170,7 @@ def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         if row.count:
             yield Found(
                 f"{row.names[0]!r} of the observation is up to {row.size:.4g}, {row.texts[0]}. Give metres and radians, "
-                "clamp it, or leave out what is hidden far away.",
+                "clamp it, or leave out bodies that are hidden by moving them far away.",
                 row.place,
                 row.count,
             )

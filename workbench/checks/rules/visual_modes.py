@@ -88,7 +88,7 @@ def _require_all_moved(checkup: Checkup) -> None:
 def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     """A goal that is hidden from pictures is in _get_obs_extra.
 
-    The policy cannot know what to do.
+    Without the goal's position in the observation, the policy cannot know what to do.
 
     ## Why
     `_hidden_objects` are not in the pictures. If the goal is one of them and its place is not in the
