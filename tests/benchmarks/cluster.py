@@ -26,11 +26,11 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.table import Row, keep
 from workbench.jobs.local_processes import Processes
+from workbench.jobs.pack_author_files import pack_worker_files
 from workbench.jobs.ray_cluster import Cluster, MessageBroker
 from workbench.jobs.ray_connection import connected
 from workbench.jobs.results_file import JobFile, JobKey
 from workbench.jobs.scheduler import Executor, Scheduler, Work
-from workbench.jobs.worker_files import pack_worker_files
 from workbench.jobs.worker_messages import ItemResult, Listener
 from workbench.machine.processes.wire import Unpacker, pack, pack_message
 from workbench.record.job import Recorded, record

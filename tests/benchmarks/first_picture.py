@@ -32,8 +32,8 @@ from workbench.live.commands import RestartWorker
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
 from workbench.live.process import worker_process
+from workbench.live.process.fork_server import start_anew, worker_forks
 from workbench.live.process.supervisor import WorkerOptions
-from workbench.live.process.worker_start import start_anew, worker_forks
 from workbench.live.view import SessionView
 from workbench.machine.processes.family import proportional_memory
 from workbench.task.description import TaskOptions
@@ -143,7 +143,7 @@ def part(name: str) -> Iterator[None]:
 
 
 def parts(num_envs: int) -> None:
-    from workbench.machine.processes.child_python import quick_imports
+    from workbench.machine.processes.child_environment import quick_imports
 
     with quick_imports():
         with part("import torch"):

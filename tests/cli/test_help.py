@@ -15,7 +15,7 @@ import pytest
 from workbench.app.help_pages import Topic, topics
 from workbench.cli import main
 from workbench.cli.output import Exit
-from workbench.machine.processes.child_python import python_command
+from workbench.machine.processes.child_environment import python_command
 
 pytestmark = pytest.mark.thorough
 

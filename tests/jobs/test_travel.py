@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from workbench.actions.choose import needed_by
-from workbench.jobs import worker_files as travel
-from workbench.jobs.worker_files import TooMuch, files_below, pack_worker_files, relocated
+from workbench.jobs import pack_author_files as travel
+from workbench.jobs.pack_author_files import TooMuch, files_below, pack_worker_files, relocated
 
 
 @pytest.fixture

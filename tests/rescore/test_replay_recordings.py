@@ -29,8 +29,8 @@ from workbench.cli.share import export_in_terminal
 from workbench.episodes.lerobot.export import ExportOptions
 from workbench.episodes.reader.reading import find_all_sources
 from workbench.episodes.row import UnreadableRecording
+from workbench.jobs.pack_author_files import pack_worker_files, relocated
 from workbench.jobs.scheduler import Scheduler, ThisProcess, Work
-from workbench.jobs.worker_files import pack_worker_files, relocated
 from workbench.live.timeline_commands import StopRescoring
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions

@@ -18,7 +18,7 @@ from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import choice
-from workbench.page.widgets.images import data_address
+from workbench.page.widgets.modality_colours import data_address
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html

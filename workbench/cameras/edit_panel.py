@@ -36,7 +36,7 @@ from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field
-from workbench.page.widgets.images import data_address
+from workbench.page.widgets.modality_colours import data_address
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render, sentence
 from workbench.page.widgets.tools import Tool, tool, tools_html

@@ -22,7 +22,7 @@ from workbench.machine.text import listed
 from workbench.page.command import Command, Refused
 from workbench.page.scene.env_grid import line_set, view_label
 from workbench.page.widgets.fields import Field, tick
-from workbench.page.widgets.images import (
+from workbench.page.widgets.modality_colours import (
     COLOUR,
     MODALITIES,
     DepthRange,

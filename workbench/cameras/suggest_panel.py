@@ -27,7 +27,7 @@ from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.scene.env_grid import box_corners, line_set
 from workbench.page.widgets.fields import Field, tick
-from workbench.page.widgets.images import data_address
+from workbench.page.widgets.modality_colours import data_address
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import viser
 
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks, ToggleRule
-from workbench.checks.findings import MAX_SHOWN, Card, cards, count, summary, undecided, without_finding
+from workbench.checks.finding_cards import MAX_SHOWN, Card, cards, count, summary, undecided, without_finding
 from workbench.checks.rule_table import RULES
 from workbench.checks.silencing import Comment, comments_without_effect
 from workbench.checks.state import RUNNING, ChecksView

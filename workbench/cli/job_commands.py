@@ -21,7 +21,7 @@ from workbench.cli.arguments import (
 )
 from workbench.cli.output import Exit, lacks_maniskill, print_text, refuse
 from workbench.envs.gpu_rules import FailOn
-from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.processes.child_environment import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.planning.options import PlanArguments
 from workbench.task.description import RecordArguments

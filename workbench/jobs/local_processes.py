@@ -14,7 +14,7 @@ from typing import Any
 
 from workbench.jobs.scheduler import NO_LIMIT, Chunk, PoolError, Result, Scheduler, Setup, Update, Work
 from workbench.jobs.worker_messages import MESSAGES, ChunkRequest, Listener, Message, WorkerQueue, work_on
-from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
+from workbench.machine.processes.child_environment import child_environment, python_command, quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.family import describe_exit, end_family
 from workbench.machine.processes.time_limit import end_after

@@ -24,11 +24,11 @@ from typing import Any
 
 import psutil
 
+from workbench.jobs.pack_author_files import WorkerFiles, pack_worker_files, relocated
 from workbench.jobs.ray_connection import AUTO, BREAKPOINT, ClusterHealth, ClusterLost, NoCluster, connected
 from workbench.jobs.scheduler import NO_LIMIT, Chunk, PoolError, Result, Scheduler, Setup, Update, Work
-from workbench.jobs.worker_files import WorkerFiles, pack_worker_files, relocated
 from workbench.jobs.worker_messages import MESSAGES, ChunkRequest, Listener, Message, WorkerQueue, work_on
-from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.processes.child_environment import quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
 from workbench.machine.versions import package_versions

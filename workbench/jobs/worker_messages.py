@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
+from workbench.jobs.pack_author_files import relocated
 from workbench.jobs.scheduler import Chunk, ItemQueue, PoolError, Scheduler, Setup, Work
-from workbench.jobs.worker_files import relocated
 from workbench.machine.processes.wire import Unpacker, pack
 from workbench.task.problem import Problem, TaskError
 

@@ -52,7 +52,7 @@ from workbench.machine.loop import BlockingPool, begin, on_loop, post
 from workbench.page.command import Command
 from workbench.page.commands import AnswerDialog, TypeAnswer
 from workbench.page.widgets.fields import Field, choice
-from workbench.page.widgets.images import address_of_jpeg
+from workbench.page.widgets.modality_colours import address_of_jpeg
 from workbench.page.widgets.notices import tell_all
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render

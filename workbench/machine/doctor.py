@@ -25,7 +25,7 @@ from rich.table import Table
 from workbench.machine import DISTRIBUTION, versions
 from workbench.machine.apt import has_apt, os_release
 from workbench.machine.maniskill_installed import lacks_maniskill, lines_if_lacking, lines_if_mixed
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 from workbench.machine.render_probe import driver_files
 from workbench.machine.software_vulkan import ensure_render_device

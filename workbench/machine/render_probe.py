@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.processes.family import describe_exit
 
 ANSWER = "render-device-answer:"

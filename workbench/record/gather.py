@@ -24,7 +24,7 @@ from workbench.episodes.side_files import side_files
 from workbench.episodes.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
 from workbench.episodes.writing.files_process import FilesProcess
 from workbench.episodes.writing.publish import RecordingError
-from workbench.jobs.worker_files import relocated
+from workbench.jobs.pack_author_files import relocated
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.versions import package_versions
 from workbench.task.description import Stepped, TaskDescription

@@ -17,8 +17,8 @@ from workbench.envs.broken_rule import warn_of
 from workbench.envs.gpu_rules import Finding
 from workbench.episodes.recorded_source import CannotEnterRecording
 from workbench.episodes.row import Source
+from workbench.jobs.pack_author_files import MAX_BYTES
 from workbench.jobs.scheduler import Chunk, Executor, Failure, ItemQueue, Scheduler, Work
-from workbench.jobs.worker_files import MAX_BYTES
 from workbench.machine.folders import CurrentFolder
 from workbench.rescore.replay_recordings import RescoredBy, opened_code, rescore
 from workbench.rescore.verdict import Verdict

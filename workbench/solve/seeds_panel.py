@@ -8,7 +8,7 @@ from pathlib import Path
 import viser
 
 from workbench.checks.commands import ChooseSeeds, ShowSolved, SolveSeeds, StopSolving, ToggleVerdict
-from workbench.checks.findings import Card, Row
+from workbench.checks.finding_cards import Card, Row
 from workbench.checks.panel import list_html
 from workbench.checks.rule_table import RULES
 from workbench.checks.state import ChecksView

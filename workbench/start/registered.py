@@ -25,7 +25,7 @@ from workbench.machine.files import read_regular_file, replace_file
 from workbench.machine.folders import cache_folder
 from workbench.machine.loop import BlockingPool, begin, do, on_loop
 from workbench.machine.maniskill_installed import installed_maniskills, lines_if_lacking
-from workbench.machine.processes.child_python import LOWEST_NICENESS
+from workbench.machine.processes.child_environment import LOWEST_NICENESS
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Question
 

@@ -21,7 +21,7 @@ from workbench.episodes.reader import reading
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.scan import scan_folder
 from workbench.episodes.row import Facts, Source, UnreadableRecording
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 
 pytestmark = pytest.mark.usefixtures("child_process")

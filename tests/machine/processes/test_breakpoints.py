@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

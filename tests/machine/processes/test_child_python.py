@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.processes.own_path import without_current_folder
 
 PACKAGE = Path(__file__).parents[3] / "workbench"

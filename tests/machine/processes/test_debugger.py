@@ -23,7 +23,7 @@ from workbench.live.panels.banners import is_busy_for_long
 from workbench.live.process import supervisor
 from workbench.live.process.supervisor import WorkerOptions
 from workbench.live.view import SessionView
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.processes.debugger import port_for_debugger
 from workbench.task.description import TaskOptions
 

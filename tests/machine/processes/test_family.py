@@ -16,7 +16,7 @@ import pytest
 
 from tests.drive.waiting import until
 from workbench.live.process.memory_limit import FamilyMemory
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.processes.family import end_family, family, proportional_memory, resident_memory
 
 _MEMBER = '''

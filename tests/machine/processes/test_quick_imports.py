@@ -9,7 +9,7 @@ from io import StringIO
 
 import pytest
 
-from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.processes.child_environment import quick_imports
 
 
 def test_garbage_collection_is_off_during_imports_and_on_again_even_after_an_error() -> None:

@@ -46,7 +46,7 @@ from workbench.page.door.access import (
 from workbench.page.door.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
-from workbench.page.door.page_guard import PageGuard
+from workbench.page.door.message_filter import PageGuard
 
 pytestmark = pytest.mark.thorough
 

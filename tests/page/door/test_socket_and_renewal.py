@@ -33,7 +33,7 @@ from tests.drive.knocking import (
 )
 from tests.drive.tabs import open_deaf_tab
 from tests.drive.waiting import until
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.page.door import listening_socket as listening
 from workbench.page.door.access import cookie_name
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server

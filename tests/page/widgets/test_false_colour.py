@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from workbench.page.widgets.images import (
+from workbench.page.widgets.modality_colours import (
     MAX_LEGEND_ENTRIES,
     NOTHING,
     VIRIDIS,

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from workbench.app.worker import start
-from workbench.live.process.worker_start import Forked, ForkEnded, NewWorker
-from workbench.machine.processes.child_python import python_command, quick_imports
+from workbench.live.process.fork_server import Forked, ForkEnded, NewWorker
+from workbench.machine.processes.child_environment import python_command, quick_imports
 from workbench.machine.processes.wire import Unpacker, pack_message
 
 _MAX_MESSAGE_BYTES = 1 << 12

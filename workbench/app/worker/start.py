@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from workbench.machine.maniskill_installed import lines_if_lacking
-from workbench.machine.processes.child_python import LOWEST_NICENESS, quick_imports
+from workbench.machine.processes.child_environment import LOWEST_NICENESS, quick_imports
 from workbench.machine.processes.family import begin_family
 from workbench.machine.versions import untested_text
 

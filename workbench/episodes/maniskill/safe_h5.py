@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.files import open_regular_file
-from workbench.machine.processes.child_python import unchanged_environment
+from workbench.machine.processes.child_environment import unchanged_environment
 
 with unchanged_environment():
     # HDF5 reads the variable when plugins are first needed; "::" disables them. A file may name a filter, which HDF5 would

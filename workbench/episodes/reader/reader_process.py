@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import get_args
 
 from workbench.episodes.reader.requests import Answer, CloseEpisodes, GetExitCode, NewReader, Request
-from workbench.machine.processes.child_python import child_environment, start_with_socket
+from workbench.machine.processes.child_environment import child_environment, start_with_socket
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack
 

@@ -22,7 +22,7 @@ from typing import IO
 import rerun_cli
 
 from workbench.machine.folders import cache_folder
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_environment import child_environment, python_command
 from workbench.machine.text import only_colours
 
 LOOPBACK = "127.0.0.1"

@@ -15,7 +15,7 @@ from workbench.envs.scene.shapes import Visual
 from workbench.episodes.writing.finish_or_recover import EpisodeFiles, make_files
 from workbench.episodes.writing.from_journal import Header, read_header
 from workbench.episodes.writing.journal import SCENE_SUFFIX, Journal, JournalReader, read_visuals
-from workbench.machine.processes.child_python import child_environment, start_with_socket
+from workbench.machine.processes.child_environment import child_environment, start_with_socket
 from workbench.machine.processes.wire import Unpacker, Unreadable, has_come, pack, pack_message
 
 _MAX_MESSAGE_BYTES = 1 << 16

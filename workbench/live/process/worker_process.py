@@ -28,6 +28,7 @@ from workbench.live.messages import (
     SingleStep,
     without_steps,
 )
+from workbench.live.process.fork_server import worker_forks
 from workbench.live.process.heartbeat import (
     INTERRUPT_SIGNAL,
     STACK_SIGNAL,
@@ -36,7 +37,6 @@ from workbench.live.process.heartbeat import (
     make_heartbeat,
 )
 from workbench.live.process.memory_limit import FamilyMemory
-from workbench.live.process.worker_start import worker_forks
 from workbench.machine.processes.family import end_family, main_thread_ended
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import MessageSocket
@@ -61,7 +61,7 @@ to request a pause before the next read."""
 class WorkerProcess:
     """One worker process. `receive` is called on one thread; all other methods are thread-safe.
 
-    Start a worker on a thread that outlives it: a worker that is not forked (`worker_start`) is ended by the
+    Start a worker on a thread that outlives it: a worker that is not forked (`fork_server`) is ended by the
     kernel with the thread that started it, so that no worker is left behind when the server is killed.
 
     A worker has no standard input, so that a task that reads it gets EOF and does not hang. It has its own

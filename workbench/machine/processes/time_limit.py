@@ -80,7 +80,7 @@ def _tell(watcher: _Watcher, line: bytes) -> None:
 
 def _start(watcher: _Watcher) -> None:
     # Imported here, since this file also runs as a script with only the standard library.
-    from workbench.machine.processes.child_python import script_command
+    from workbench.machine.processes.child_environment import script_command
 
     read, watcher.pipe = os.pipe()
     try:

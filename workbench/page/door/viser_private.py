@@ -31,9 +31,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 
-from workbench.machine.processes.child_python import unchanged_environment
+from workbench.machine.processes.child_environment import unchanged_environment
 from workbench.machine.versions import command_for_tested_versions
-from workbench.page.door.client_connection import CompressWhenFar, PageConnection
 from workbench.page.door.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.page.door.connection_limits import (
     Connection,
@@ -42,7 +41,8 @@ from workbench.page.door.connection_limits import (
     close_when_stalled,
 )
 from workbench.page.door.listening_socket import ServerError
-from workbench.page.door.page_guard import PageGuard
+from workbench.page.door.message_filter import PageGuard
+from workbench.page.door.send_pacing import CompressWhenFar, PageConnection
 
 Hook = Callable[[ServerConnection, Request], Response | None]
 Serve = Callable[[ServerConnection], Awaitable[None]]

@@ -70,7 +70,7 @@ class SentPoses:
 
     A pose is sent again, rounded to a fraction of a pixel, only when the last sent pose is more than a pixel
     off. viser sends a whole batch when one pose of it changes; as most values then equal previous ones,
-    compression makes the message small (`door.client_connection`). A body at rest gets its exact pose.
+    compression makes the message small (`door.send_pacing`). A body at rest gets its exact pose.
 
     Args:
         reach: (R,) radius of each body around its frame, metres.

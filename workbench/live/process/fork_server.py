@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import IO
 
-from workbench.machine.processes.child_python import child_environment, python_command, start_with_socket
+from workbench.machine.processes.child_environment import child_environment, python_command, start_with_socket
 from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, has_come, pack
 

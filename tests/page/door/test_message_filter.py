@@ -13,7 +13,7 @@ from websockets.sync.connection import Connection
 from tests.drive.knocking import CAMERA, Bell, client, close_code, say
 from tests.drive.tabs import messages_in
 from tests.drive.waiting import until
-from workbench.page.door import page_guard
+from workbench.page.door import message_filter
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 pytestmark = pytest.mark.thorough
@@ -116,7 +116,7 @@ def test_a_large_message_of_tiny_objects_is_not_decoded(gated_server, bystander,
 def test_a_flooding_page_is_throttled_then_disconnected_and_the_others_go_on(
     gated_server, bystander, monkeypatch
 ):
-    monkeypatch.setattr(page_guard, "MAX_SLOWED_SECONDS", 0.5)
+    monkeypatch.setattr(message_filter, "MAX_SLOWED_SECONDS", 0.5)
     flooded = Bell(gated_server)
     gone = threading.Event()
 

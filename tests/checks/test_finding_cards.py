@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from workbench.checks.findings import cards, count, summary
+from workbench.checks.finding_cards import cards, count, summary
 from workbench.checks.results import RuleResult
 from workbench.checks.state import ChecksView
 from workbench.envs.gpu_rules import Degree, Finding

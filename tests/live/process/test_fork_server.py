@@ -15,25 +15,25 @@ from tests.drive.processes import workers_of
 from tests.drive.session import live_session, wait_until
 from tests.drive.waiting import TIMEOUT_SECONDS, until
 from tests.live.hazards import write_task
-from workbench.live.process import worker_process, worker_start
+from workbench.live.process import fork_server, worker_process
+from workbench.live.process.fork_server import WorkerForks
 from workbench.live.process.worker_process import WorkerProcess
-from workbench.live.process.worker_start import WorkerForks
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
 
 @pytest.fixture(scope="module")
-def fork_server(child_process: None) -> Iterator[WorkerForks]:
+def started_forks(child_process: None) -> Iterator[WorkerForks]:
     forks = WorkerForks()
     yield forks
     forks.end()
 
 
 @pytest.fixture
-def forks(fork_server: WorkerForks, monkeypatch: pytest.MonkeyPatch) -> WorkerForks:
+def forks(started_forks: WorkerForks, monkeypatch: pytest.MonkeyPatch) -> WorkerForks:
     """The fork server of this file's tests."""
-    monkeypatch.setattr(worker_process, "worker_forks", fork_server)
-    return fork_server
+    monkeypatch.setattr(worker_process, "worker_forks", started_forks)
+    return started_forks
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_a_worker_with_other_code_or_settings_is_not_forked(
     for change in (
         lambda to: to.setenv("MS_ASSET_DIR", str(tmp_path)),
         lambda to: to.chdir(tmp_path),
-        lambda to: to.setattr(worker_start, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))),
+        lambda to: to.setattr(fork_server, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))),
     ):
         with monkeypatch.context() as changed:
             change(changed)

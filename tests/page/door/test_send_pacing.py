@@ -18,8 +18,8 @@ from websockets.exceptions import ConnectionClosed
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.tabs import camera_message, handshake, messages_in
 from tests.drive.waiting import until
-from workbench.page.door.client_connection import CompressWhenFar, PageConnection, WhenFar
 from workbench.page.door.gated_server import GatedServer
+from workbench.page.door.send_pacing import CompressWhenFar, PageConnection, WhenFar
 
 pytestmark = pytest.mark.thorough
 
