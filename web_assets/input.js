@@ -126,7 +126,7 @@
     what.textContent = `No answer from the workbench at ${location.host}.`;
     gone.append(
       what,
-      " What you see is the last that it sent, and nothing here can be pressed. If its command still runs in a terminal, look at the way there (network, ssh). If it has ended, start it again and open the address that it prints. This page goes on by itself as soon as it answers.",
+      " The page shows the last state that it received; commands are not possible. If the workbench still runs in its terminal, check the connection (network, ssh). If it has ended, start it again and open the address that it prints. This page continues as soon as it answers.",
     );
     document.body.append(gone);
   }
@@ -139,7 +139,7 @@
 
   // Commands without a reply may have been carried out or not. They are not retried: minutes later that would be a surprise.
   function lost() {
-    if (unanswered.size) tell("The connection was lost: what was asked for last may not have been done.");
+    if (unanswered.size) tell("The connection was lost: the last command may not have been carried out.");
     unanswered.clear();
     newest.clear();
     entered.clear();
@@ -433,8 +433,8 @@
     if (whole && Number.isFinite(number) && !Number.isInteger(number)) return `${number} is not a whole number`;
     if (Number.isFinite(number) && (low ?? number) <= number && number <= (high ?? number)) return "";
     if (low === null && high === null) return "it is too large";
-    if (high === null) return `it is at least ${low}`;
-    return low === null ? `it is at most ${high}` : `it goes from ${low} to ${high}`;
+    if (high === null) return `it must be at least ${low}`;
+    return low === null ? `it must be at most ${high}` : `it must be from ${low} to ${high}`;
   }
 
   // The value of an input for its command; undefined if it is not a valid number.

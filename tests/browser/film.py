@@ -91,7 +91,7 @@ def take_film(desk: Desk, path: Path) -> None:
 
     def find(frame: int) -> None:
         if frame == 0:
-            page.get_by_label("Show", exact=True).first.select_option(label="without success last")
+            page.get_by_label("Show", exact=True).first.select_option(label="last episode without success")
         elif frame == 1:
             desk.press("e")
         elif frame == 2:

@@ -69,7 +69,7 @@ def test_a_recording_is_rescored_and_entered_with_todays_and_with_its_own_code(
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
         page.get_by_role("button", name="Rescore the open recordings").click()
         expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=TIMEOUT_MS)
-        page.get_by_text("reward by up to").click()
+        page.get_by_text("reward changed by up to").click()
         expect(page.get_by_text("step 1 / 15").first).to_be_visible()
 
         page.get_by_role("tab", name="Review").click()

@@ -365,7 +365,7 @@ def test_a_lost_command_channel_reconnects_and_sends_nothing_twice(small: SmallP
             document.body.dispatchEvent(new KeyboardEvent("keydown", {key: "f", code: "KeyF", bubbles: true}));
         })"""
     )
-    expect(small.page.get_by_text("may not have been done")).to_be_visible()
+    expect(small.page.get_by_text("may not have been carried out")).to_be_visible()
     deadline = time.monotonic() + 60
     while not small.came and time.monotonic() < deadline:
         small.page.keyboard.press("s")

@@ -156,10 +156,10 @@ def test_a_number_is_committed_when_complete_and_an_invalid_one_is_reverted(desk
     page.get_by_role("tab", name="Run").click()
     seed = page.get_by_label("Seed", exact=True)
     for typed, says in (
-        ("9223372036854775807", "Seed: it goes from 0 to 2147483647. It stays 0."),
-        ("-99999999999999999999999", "Seed: it goes from 0 to 2147483647. It stays 0."),
+        ("9223372036854775807", "Seed: it must be from 0 to 2147483647. It stays 0."),
+        ("-99999999999999999999999", "Seed: it must be from 0 to 2147483647. It stays 0."),
         ("3.7", "Seed: 3.7 is not a whole number. It stays 0."),
-        ("1e400", "Seed: it goes from 0 to 2147483647. It stays 0."),
+        ("1e400", "Seed: it must be from 0 to 2147483647. It stays 0."),
         ("abc", "Seed: \u201cabc\u201d is not a number. It stays 0."),
         ("", "Seed: it was left empty. It stays 0."),
     ):
@@ -197,7 +197,9 @@ def test_a_number_is_committed_when_complete_and_an_invalid_one_is_reverted(desk
 
     past.filter(visible=True).last.fill("7")
     page.keyboard.press("Enter")
-    expect(rejection).to_have_text(re.compile(r"^step of the past: it goes from -\d+ to 0\. It stays 0\.$"))
+    expect(rejection).to_have_text(
+        re.compile(r"^step of the past: it must be from -\d+ to 0\. It stays 0\.$")
+    )
     past.filter(visible=True).last.fill("-2")
     page.keyboard.press("Enter")
     desk.timeline_says("2 steps ago")

@@ -345,7 +345,7 @@ def test_episodes_kept_before_a_failure_are_reported(
     assert record_in_terminal(failing_policy) == 1
     printed = capsys.readouterr()
     assert "policy failed" in printed.err and "tired" in printed.err
-    assert "without a result, 1 in all: episode 1" in printed.err
+    assert "1 item without a result: episode 1" in printed.err
     assert "1 episode recorded, 1 without a result" in printed.err
     assert "Look at them with: workbench review" in printed.out
 

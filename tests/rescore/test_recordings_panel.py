@@ -160,7 +160,7 @@ def test_a_row_names_the_changes_and_an_unchanged_row_is_paler(rescoring: Rescor
     rows = re.findall(r'<tr [^>]*class="([^"]*)" title="[^"]*">(.*?)</tr>', html)
     shown = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
     assert shown == [
-        ([], "|seed 7||reward by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
+        ([], "|seed 7||reward changed by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
         (["wb-same"], "|seed 5||unchanged||10|"),
         (["wb-same"], "|seed 6||not rescored: it has no step|||"),
     ]

@@ -50,7 +50,7 @@ def test_a_reward_differs_from_a_fraction_of_the_largest_reward_on(share: float,
 def test_the_first_and_largest_reward_difference_are_steps_of_the_episode() -> None:
     found = compare(0, scores(), scores([0.0, 1.5, 4.0, 3.5]), begin=10)
     assert (found.first_difference, found.look_at, found.largest) == (12, 13, 2)
-    assert verdict_text.change_text(found) == "reward by up to 2, from step 12"
+    assert verdict_text.change_text(found) == "reward changed by up to 2, from step 12"
 
 
 def test_success_and_fail_are_located_by_their_first_true_step() -> None:
@@ -76,7 +76,7 @@ def test_a_flag_that_changes_after_its_first_true_step_is_reported() -> None:
         "0.5 does not count as true"
     )
     both = compare(0, scores(success=[1, 1, 1, 1, 1]), scores([9, 1, 2, 3], success=[1, 0, 1, 1, 1]))
-    assert verdict_text.change_text(both) == "reward by up to 9, from step 1" and both.look_at == 1
+    assert verdict_text.change_text(both) == "reward changed by up to 9, from step 1" and both.look_at == 1
 
 
 def test_other_shared_entries_are_named_but_count_as_no_difference() -> None:

@@ -258,7 +258,7 @@ assert len(made) == 1
         (
             "from places import X\nnote(X)",
             "X = 1\nX += 1",
-            "`X` gets other values than its current one in lines 1 and 2",
+            "none of the assignments to `X` (lines 1 and 2) gives its current value",
         ),
         (
             "import places\nnote(places.X)",
@@ -276,7 +276,7 @@ def test_of_several_assignments_the_one_with_the_running_value_is_chosen() -> No
     text = "X = 1.5\ndef f():\n    note(X)\nif len('ab') > 1:\n    X = 2.5\nelse:\n    X = max(3, 4)\nf()"
     assert described(text) == "2.5 < X"
     text = text.removesuffix("f()") + "vars()['X'] = 7.5\nf()"
-    assert described(text) == "`X` gets other values than its current one in lines 9 and 13 and 15"
+    assert described(text) == "none of the assignments to `X` (lines 9 and 13 and 15) gives its current value"
 
 
 def test_values_in_a_function_are_read_from_its_frame() -> None:

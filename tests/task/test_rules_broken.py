@@ -144,7 +144,7 @@ def test_a_breach_that_stops_is_reported_at_the_authors_line(
         (LOST, "not-applied", "The pose of 'cube' in envs 0, 1, 2, 3"),
         (NEIGHBOURS_BEHIND, "behind-the-tensors", "Entity.set_pose()"),
         (STEPPED, "stepped-in-reset", "envs 1, 2, 3"),
-        (BEHIND, "behind-the-tensors", "goes behind the tensors"),
+        (BEHIND, "behind-the-tensors", "bypasses the tensors"),
         (REWRITTEN, "rows-rewritten", "self.target is changed in envs 1, 2, 3, which are not being reset"),
         (HIDES, "not-applied", "The pose of 'cube'"),
     ],

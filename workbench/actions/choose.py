@@ -442,8 +442,8 @@ def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     for array in arrays:
         if array.ndim != 2 or array.shape[0] == 0 or array.dtype.kind not in "fiub":
             raise ValueError(
-                f"{path} holds {array.dtype} of shape {array.shape}; actions are numbers of shape (steps, dimensions), in a "
-                ".npy also (episodes, steps, dimensions)"
+                f"{path} holds {array.dtype} of shape {array.shape}; expected numbers of shape (steps, dimensions); a .npy "
+                "may also have (episodes, steps, dimensions)"
             )
     if not arrays:
         raise ValueError(f"{path} holds no array")

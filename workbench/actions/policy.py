@@ -106,7 +106,7 @@ def _hint(name: str, attribute: str, task_folder: Path | None) -> str:
     for folder in (Path.cwd(), task_folder or Path.cwd()):
         file = folder / f"{name}.py"
         if file.is_file() and is_library(name):
-            return f", which is a library's module; name the file: {file}:{attribute}"
+            return f"; {name} is a library's module, so name the file: {file}:{attribute}"
     return ""
 
 

@@ -332,7 +332,7 @@ class ChooseMeasured(Command, frozen=True):
 
 
 class ChooseMeasuredSteps(Command, frozen=True):
-    """Choose over how many steps of the episode, at most, a camera is measured."""
+    """Set the maximum number of steps of the episode over which a camera is measured."""
 
     steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 

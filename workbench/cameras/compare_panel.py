@@ -28,8 +28,8 @@ from workbench.pictures.camera_conventions import angle_between
 Other = Literal["file", "before", "kept"]
 NAMES: dict[Other, str] = {"file": "as in the file", "before": "as in the file before", "kept": "saved as A"}
 OTHER_HINT = (
-    "The placement to compare with the camera's current one. As in the file before: its placement before the last "
-    "saved change."
+    'The placement to compare with the current one. "As in the file before" is '
+    "the file's placement before its last change."
 )
 PICTURE_PIXELS = 256
 """Longer side of each picture."""

@@ -171,7 +171,7 @@ class CameraExport(PagePart[SessionView]):
         self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
         client.add_notification(
             "Placed",
-            "The pose was applied, but no lens: enter the text's intrinsic matrix, if it has one, under Lens "
+            "The pose was applied; the lens was not. If the calibration has an intrinsic matrix, enter it under Lens "
             "and image.",
             color="green",
             auto_close_seconds=8.0,

@@ -192,7 +192,7 @@ class CameraReportPanel(PagePart[SessionView]):
         if moments:
             span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
             over, unit = (
-                f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; click a step to go there",
+                f"{counted(count, 'moment')} of env {report.envs[-1]}'s episode, {span}; click a step to show that moment",
                 "steps",
             )
         width, height = report.measured_size
@@ -202,8 +202,8 @@ class CameraReportPanel(PagePart[SessionView]):
             before=results.measuring,
             new=new,
             over=over,
-            how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: of the whole scene, "
-            "without the robot if it is in view, and of each object alone",
+            how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: the whole scene; "
+            "the scene without the robot, if the robot is in view; each object alone",
             unit=unit,
             moments=moments,
             headline=headline(report, unit),
@@ -245,7 +245,7 @@ class CameraReportPanel(PagePart[SessionView]):
             for picture in sheet[:MAX_PICTURES]
             if picture.rgb is not None
         ]
-        note = ("worst first, " if report is not None else "") + "click one to select its env"
+        note = ("worst first, " if report is not None else "") + "click a picture to select its env"
         if len(sheet) > MAX_PICTURES:
             note = f"{MAX_PICTURES} of {len(sheet)}; {note}"
         return render("camera_sheet", cells=cells, note=note, new=new)

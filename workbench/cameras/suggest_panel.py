@@ -50,9 +50,7 @@ MIN_PERFECT_SCORE = 0.995
 """Scores of at least this are shown as 1.00. If all offers have such a score, a note says how to choose."""
 BOX_COLOUR = (230, 73, 128)
 
-RESETS_HINT = (
-    "Number of freshly reset envs in which each placement is measured; at most the number of envs, and 16."
-)
+RESETS_HINT = "Number of freshly reset envs in which each placement is measured: at most 16, and at most the number of envs."
 LOW_HINT = "Lowest corner of the box that the camera may be placed in, in metres."
 
 Corner = tuple[float, float, float]

@@ -164,7 +164,7 @@ def solve(
 ) -> int:
     """Solve a task by planning with its own reward before training on it: reports how many seeds are solved, in how many
     steps, and reward problems that the rollouts find. Episodes are recorded. The exit code is 1 if no seed is solved, or if
-    the reward breaks a rule of the degree of --fail-on, as in workbench check --solve.
+    the reward breaks a rule of the degree of --fail-on or higher, as in workbench check --solve.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
@@ -175,8 +175,8 @@ def solve(
             differ.
         pictures: record the pictures of every camera.
         out: folder for the recordings.
-        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
-            the folder.
+        upload: fsspec URL (such as s3://bucket/folder) to which each finished episode is
+            uploaded, instead of being kept in the folder.
         fail_on: lowest degree of a broken rule that makes the exit code 1, as for workbench check; the rules of the reward
             have the degree warn. With never, the exit code is 0 even if no seed is solved.
         json: print the result as JSON instead of text.
@@ -242,8 +242,8 @@ def sweep(
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         settings: a name and its values, as in --set reach_weight=0.5,1,2 (each in JSON, or text); repeatable, for all
-            combinations. Names a module or class constant with a literal value in the file, or an argument of the task
-            class.
+            combinations. The name is a constant of the file (module or class) with a literal
+            value, or an argument of the task class.
         seeds: number of episodes for each combination, with the same seeds for all.
         actions: random, zero, hold; solve, which plans with rollouts of the task and its own reward; or a policy as
             module:function or file.py:function.
@@ -251,8 +251,8 @@ def sweep(
         pictures: record the pictures of every camera.
         out: folder for the recordings and results.parquet; default: a folder named after the task, in
             sweeps/.
-        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
-            the folder; results.parquet is in both.
+        upload: fsspec URL (such as s3://bucket/folder) to which each finished episode is
+            uploaded, instead of being kept in the folder; results.parquet is in both.
         json_file: also write the results to this file, as JSON.
         csv_file: also write a row for each episode to this file, as CSV.
     """

@@ -275,8 +275,9 @@ def export(
         maniskill: new file (.h5, with a .json) of ManiSkill demonstrations, as its baselines load them; must not exist
             yet. Of the other options, only --only-successes and --only-fitting apply.
         only_successes: leave out recordings that never reach success.
-        only_fitting: leave out recordings that cannot be read or lack data of the first one (cameras,
-            dimensions), and print their names. Without this option, such a recording ends the export.
+        only_fitting: leave out recordings that cannot be read or lack data that the first
+            recording has (cameras, dimensions), and print their names. Without this
+            option, such a recording ends the export.
         task: the task in words, for language-conditioned policies; default: its id.
         fps: frames per second; the control rate must be a whole multiple of it. Default: the control rate.
         cameras: names of cameras; default: all. --cameras without a name makes a dataset without films.

@@ -179,7 +179,8 @@ def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> 
     for problem, numbers in by_kind(failures):
         print_problem(problem)
         items = listed([names(number) for number in numbers], _MAX_FAILED_ITEMS)
-        err.print(escape(f"    without a result, {len(numbers)} in all: {items}"), soft_wrap=True)
+        count = "1 item" if len(numbers) == 1 else f"{len(numbers)} items"
+        err.print(escape(f"    {count} without a result: {items}"), soft_wrap=True)
 
 
 def print_finding(finding: Finding) -> None:
@@ -225,9 +226,9 @@ def _what_runs(failed: TaskFailed) -> str:
     if failed.at_run:
         what = "the policy" if failed.problem.stage == "policy" else "the version"
         process = f"; another process loads the version again: {failed.spoiled}" if failed.spoiled else ""
-        return f"{what} failed while the task ran; the task is paused{process}; save a fixed file, or reset to continue"
+        return f"{what} failed while the task ran, and the task is paused{process}. Save a fixed file, or reset, to continue"
     if failed.spoiled or failed.problem.stage == "worker":
-        return "the last good version is loaded again, in the state in which it was"
+        return "the last good version is loaded again and restored to its last state"
     return "the last good version stays loaded, running or paused as before"
 
 

@@ -74,8 +74,8 @@ def find_renderer() -> Renderer | None:
         return Renderer("gpu" if device == "cuda" else "cpu", _device_summary() or "unknown device")
     if (name := _device_summary()) is not None:
         raise BackendUnavailable(
-            f"SAPIEN's renderer on {name} is held under another name by a material or texture that was made "
-            "before any env. Make it in _load_scene, while the scene is built."
+            f"A material or texture made before any env holds SAPIEN's renderer on {name} under another name. "
+            "Create materials and textures in `_load_scene`."
         )
     return None
 

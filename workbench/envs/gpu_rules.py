@@ -685,7 +685,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "evaluate",
             """The entries success and fail of evaluate() are bool tensors.
 
-            ManiSkill's wrappers fail on them, such as ManiSkillVectorEnv with record_metrics.
+            ManiSkill's wrappers, such as ManiSkillVectorEnv with record_metrics, fail on entries of another dtype.
 
             ## Why
             ManiSkill's `step` accepts numbers for them. Its wrappers do not: `ManiSkillVectorEnv` with
@@ -739,7 +739,8 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "_get_obs_extra",
             """Observations have a row for each env.
 
-            They are broadcast over the envs, or an error comes up somewhere else.
+            An observation without a row for each env is broadcast over the envs, or an error comes up somewhere
+            else.
 
             ## Why
             Observations are flattened and joined along the last dimension. A leaf without a row for each env

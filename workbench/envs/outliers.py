@@ -70,7 +70,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             scene explodes more often on the GPU.
 
             ## Mend
-            Let nothing overlap and nothing be thrown. If a body may be lost, end the episode there.
+            Make sure that no bodies overlap and none is thrown. If a body may be lost, end the episode there.
 
             ```python fragment
             def evaluate(self):

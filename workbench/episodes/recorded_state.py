@@ -38,13 +38,15 @@ def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> di
             continue
         value, width = state.get(name), BODY + 2 * maniskill_private.joints_of(struct)
         if value is None or np.isnan(value).any():
-            missed[name] = "the recording has none of this name, so it keeps its state from the reset"
+            missed[name] = (
+                "the recording has no state of this name; the env's part keeps its state from the reset"
+            )
         elif value.shape != (width,):
             missed[name] = f"its state has {width} numbers now, and {value.shape[-1]} in the recording"
     for name, value in state.items():
         kind = name.partition("/")[0]
         if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
-            missed[name] = "this env has none of this name"
+            missed[name] = "this env has nothing of this name"
     return missed
 
 

@@ -76,7 +76,7 @@ def job_of(
     if file is not None and file.is_file():
         about["the task's text"] = read_content(file).hash[:12]
     for path in files:
-        about[f"what {path.name} holds"] = _sum(path)
+        about[f"the content of {path.name}"] = _sum(path)
     about.update(_flat("", request, {"task", *leaves_out}))
     folder = getattr(request, "out", None)
     return JobKey(command, about, pack(request), "" if folder is None else str(Path(folder).absolute()))

@@ -223,7 +223,7 @@ def _gpu() -> list[DoctorFinding]:
     cuda: list[str] = answer["cuda"]
     if cuda:
         found = f"{', '.join(cuda)} (torch for CUDA {answer['built']})"
-        what = "on the CPU core, unless you pass --backend gpu"
+        what = "envs run on the CPU, unless you pass --backend gpu"
         advice = f"For --backend gpu: {answer['why_not']}"
         if answer["why_not"] is None:
             what += f" (PhysX GPU library {answer['library']})"

@@ -48,7 +48,7 @@ def _flag_text(name: str, was: int | None, now: int | None) -> str:
 def _reward_change(verdict: Verdict[Any]) -> str:
     """Text of the largest change of the reward; if that is not finite, text of the returns."""
     if math.isfinite(verdict.largest):
-        return f"reward by up to {number_text(verdict.largest)}"
+        return f"reward changed by up to {number_text(verdict.largest)}"
     was, now = verdict.returns
     if math.isfinite(was):
         return f"reward {number_text(now)} now"

@@ -38,7 +38,7 @@ class TakeOnlySuccesses(Command, frozen=True):
 
 
 class TakeOnlyCompatible(Command, frozen=True):
-    """Omit recordings that cannot be read or lack data of the first one from a dataset, or stop at them."""
+    """Leave recordings that cannot be read, or lack data that the first one has, out of a dataset, or stop at them."""
 
     on: bool
 

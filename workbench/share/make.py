@@ -213,7 +213,9 @@ def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     if made.left_out:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:
-        words += f"; {len(made.not_fitting)} left out (cannot be read, or lack data of the first one)"
+        words += (
+            f"; {len(made.not_fitting)} left out (cannot be read, or lack data that the first recording has)"
+        )
     return Made((made.folder,), " ".join([f"{words}.", *made.notes]), tuple(made.not_fitting))
 
 
@@ -230,7 +232,9 @@ def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     if made.left_out:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:
-        words += f"; {len(made.not_fitting)} left out (cannot be read, or lack data of the first one)"
+        words += (
+            f"; {len(made.not_fitting)} left out (cannot be read, or lack data that the first recording has)"
+        )
     words += ". Colour pictures were recorded as JPEG, so they are not exact." if made.lossy else "."
     return Made((made.file,), words, tuple(made.not_fitting), incomplete=tuple(made.incomplete))
 

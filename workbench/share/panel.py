@@ -55,10 +55,8 @@ DATASETS: tuple[What, ...] = ("lerobot", "maniskill")
 """Kinds for which all recordings become one dataset, in the folder of recordings."""
 ALL_CAMERAS = "every camera"
 SHARED = {"the selected recordings": False, "the open recordings": True}
-SUCCESSES_HINT = "Leave out recordings that reach success at no step"
-FITTING_HINT = (
-    "Leave out recordings that cannot be read, or lack data of the first one; the result names them"
-)
+SUCCESSES_HINT = "Leave out recordings without success at any step"
+FITTING_HINT = "Leave out recordings that cannot be read, or lack data that the first recording has; the result names them"
 TASK_HINT = "In words, for policies that take a language instruction; empty: the task's id"
 MAX_RESULTS = 6
 """Maximum number of results in the list, newest first."""

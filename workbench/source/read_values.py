@@ -374,7 +374,7 @@ class ValueReader:
             raise Unknown(
                 f"`{code}` gets the same value in lines {lines}, and it is unknown which of them ran"
             )
-        raise Unknown(f"`{code}` gets other values than its current one in lines {lines}")
+        raise Unknown(f"none of the assignments to `{code}` (lines {lines}) gives its current value")
 
     def _attribute_bindings(self, file: SourceFile, node: ast.Attribute) -> list[Binding]:
         """The bindings of ``self.NAME``, ``cls.NAME`` or ``Class.NAME``."""

@@ -234,8 +234,8 @@ class RecordArguments:
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         out: folder for the files.
-        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
-            the folder.
+        upload: fsspec URL (such as s3://bucket/folder) to which each finished episode is uploaded, instead of being kept in the
+            folder.
         episodes: number of episodes over all envs; default: 4, or as many as a file of actions has.
         successes: continue until this many episodes succeed, and keep only those.
         tries: with --successes, give up after this many episodes; default: 100 for each success.
@@ -244,8 +244,8 @@ class RecordArguments:
             demonstrations, which begin from their own seeds.
         use_env_states: restore the demonstration's env state after each step.
         pictures: record the pictures of every camera (--no-pictures is much faster).
-        fast_pictures: render simplified meshes: several times as many pictures per second without a GPU, slightly different
-            from a GPU's. The recordings are marked, in their .json and in the review.
+        fast_pictures: render simplified meshes: several times faster without a GPU; the pictures differ slightly from a GPU's. The
+            recordings are marked, in their .json and in the review.
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
         seconds_per_seed: wall time limit of an episode: after it, the episode ends at its next step, solved
             or not. Which episodes reach the limit depends on the machine and its load, so a second run may

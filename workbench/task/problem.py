@@ -342,7 +342,7 @@ def _message(exc: BaseException) -> str:
     except Exception as failure:  # the author's own __str__ may raise
         text = f"<its __str__ raised {type(failure).__qualname__}>"
     if isinstance(exc, BdbQuit) and not text:
-        text = "a debugger's prompt was quit, or had no terminal: remove its call, just before this line"
+        text = "a debugger prompt was quit or had no terminal: remove the call just before this line"
     return shorten(f"{name}: {text}{_suggestion(exc)}" if text.strip() else name)
 
 

@@ -296,7 +296,7 @@ class _Comparison:
             label = self._label(symbol.key)
             if symbol.key not in seen:
                 for name in sorted(symbol.mentions & _CAMERA_ATTRIBUTES):
-                    raise _NeedsRebuild(f"{label} uses {name}, so cameras are not as configured")
+                    raise _NeedsRebuild(f"{label} uses {name}, so the cameras may differ from their configs")
                 continue
             for name in sorted(symbol.mentions & _RANDOM_NAMES):
                 raise _NeedsRebuild(f"{label} uses {name}: the cameras would be sampled again")

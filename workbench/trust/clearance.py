@@ -273,8 +273,8 @@ class Clearances:
         if not named:
             return None
         return (
-            f"a recording of {_printable(info.task)} that was not made here names files for its env to read "
-            f"({', '.join(named[:3])}), which needs --trust on the command line"
+            f"a recording of {_printable(info.task)}, not made here, names files that its env would read "
+            f"({', '.join(named[:3])}): only --trust allows this"
         )
 
     def _without_asking(self, code: CodeToRun) -> TaskName | NotCleared | _Undecided:

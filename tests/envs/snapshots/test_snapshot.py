@@ -433,7 +433,7 @@ def test_an_edited_task_gets_states_by_name_and_reports_the_rest(pick: BaseEnv) 
     torch.testing.assert_close(edited.agent.robot.get_qpos()[[0, 2]], qpos[[5, 1]])
     assert edited.elapsed_steps.tolist() == [5, 0, 5, 0]
     back = restore_snapshot(pick, take_snapshot(edited, [2]), [3])
-    assert back.not_carried["actor ball"] == "this env has none of this name"
+    assert "this env has no" in back.not_carried["actor ball"]
     edited.close()
 
 

@@ -158,8 +158,8 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
 def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """The quaternion of a camera has length 1.
 
-    The picture is turned and zoomed, and extrinsics are scaled. look_at straight down or up gives such a
-    quaternion (tilt the view a little).
+    The picture is turned and zoomed, and extrinsics are scaled. look_at straight down or up gives a
+    quaternion of length 0.707: tilt the view a little.
 
     ## Why
     SAPIEN does not normalise the quaternion of a camera: a shorter one turns and zooms the picture. It also

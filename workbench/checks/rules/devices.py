@@ -86,8 +86,8 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     for place, count in uses.copies.items():
         yield Found(
             f"{place[2]}() copies a tensor to the host {_how_often(count, uses)} ({uses.written[place]}): a GPU has to "
-            "wait each time. Stay in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for "
-            "rows.",
+            "wait each time. Use tensor operations: torch.where instead of if, x.any(dim=1) for a condition, indices and "
+            "masks to select rows.",
             place,
         )
 

@@ -197,7 +197,7 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
             found = True
             yield Found(
                 f"The entry {name!r} of evaluate() is a {entry.what} for all {task.num_envs} envs together. Give it a row "
-                "for each env, or leave it out: what only people read can be logged elsewhere.",
+                "for each env, or leave it out: log a number for people elsewhere.",
                 checkup.places.entry(name.rpartition("/")[2]),
             )
     if not found:

@@ -103,7 +103,8 @@ def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
 def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
     """Assets that need a download are named in asset_download_ids.
 
-    ManiSkill asks for the download at a prompt, which a cluster does not have, or does not find the files.
+    ManiSkill asks for the download at a prompt, which a cluster does not have, or the build fails because the
+    files are missing.
 
     ## Why
     `asset_download_ids` tells ManiSkill what to fetch before the task is made. Without it, the build fails on

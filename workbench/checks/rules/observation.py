@@ -86,7 +86,7 @@ def see_observation_constant(checkup: Checkup) -> Iterator[Seen]:
 def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Numbers of an observation differ between episodes or steps.
 
-    They carry no information, and normalisers divide by their zero variance.
+    Constant numbers carry no information, and normalisers divide by their zero variance.
 
     ## Why
     A number that never changes tells a policy nothing. A normaliser divides by its variance of 0, and a later
@@ -146,8 +146,8 @@ def see_observation_huge(checkup: Checkup) -> Iterator[Seen]:
 def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Numbers of an observation are below 1000.
 
-    They drown all other numbers in a network without normalisation; most often the cause is a hidden body or
-    a wrong unit.
+    Larger numbers drown all others in a network without normalisation; most often the cause is a hidden body
+    or a wrong unit.
 
     ## Why
     Without a normaliser, a number of 100000 drowns all others in the first layer. Most often the cause is a

@@ -392,7 +392,8 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
             )
         elif name not in robots and (np.abs(rows[:, 3]) > 1 - 1e-6).all():
             yield Note(
-                f"{name} is turned by half a turn about z in every env: (0, 0, 0, 1) is no turn in the order x, y, z, w"
+                f"{name} has the quaternion (0, 0, 0, 1) in every env, half a turn about z; in the order x, y, z, w it would "
+                "be no turn"
             )
     if found:
         return

@@ -40,9 +40,9 @@ def bodies_stay(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotApplicable("nothing in the task moves")
     for row in sorted(together(rows, worst=True), key=lambda row: -row.size):
         yield Found(
-            f"{row.texts[0]}; in this or another way the body leaves the scene in "
-            f"{of(len(row.seeds), tried(rows), 'random episode')} (seed {listed(row.seeds)}). Let nothing overlap and "
-            "nothing be thrown, or end an episode in which the body is lost: return `fail` from evaluate().",
+            f"{row.texts[0]}. The body leaves the scene in {of(len(row.seeds), tried(rows), 'random episode')} "
+            f"(seed {listed(row.seeds)}). Avoid overlaps and throwing, or return `fail` from evaluate() when the body is "
+            "lost.",
             row.place,
             len(row.seeds),
         )

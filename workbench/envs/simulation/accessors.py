@@ -552,7 +552,7 @@ def _may_write(system: BatchedCpuSystem, env: int, owner: Any, called: str, inst
     is_left = "" if may_write else "; here the call is ignored, because this env is not being reset"
     system.report(
         "behind-the-tensors",
-        f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing{is_left}. Use {instead} "
+        f"{called} on '{name}' (env {env}) bypasses the tensors: on the GPU it does nothing{is_left}. Use {instead} "
         "of ManiSkill's object, which sets all envs, or those that are being reset.",
     )
     return may_write

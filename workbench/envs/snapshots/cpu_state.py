@@ -398,7 +398,7 @@ def _joined(
         matches.append(source)
         at += part.size
     for source in index_of.values():
-        missed[str(parts[source])] = "this env has none of this name"
+        missed[str(parts[source])] = "this env has no actor or articulation of this name"
     return numbers.tobytes(), matches
 
 

@@ -355,7 +355,7 @@ def write_gpu_state(
     position, structs = dict(zip(env_idx, positions, strict=True)), scene_index(env).states
     for name, rows in state.states.items():
         if name not in structs and not np.isnan(rows[positions]).all():
-            missed[_plain_name(name)] = "this env has none of this name"
+            missed[_plain_name(name)] = "this env has no actor or articulation of this name"
     for name, struct in structs.items():
         width = maniskill_private.joints_of(struct)
         kept = state.states.get(name, np.zeros((0, 0), np.float32))
@@ -364,7 +364,9 @@ def write_gpu_state(
         fits = kept.shape[1] == BODY + (2 + len(_JOINT_TENSORS)) * width
         fitting = [i for i in targets if fits and not np.isnan(kept[position[i]]).any()]
         if len(fitting) < len(targets):
-            missed[_plain_name(name)] = "the snapshot has none of this name and shape; left unchanged"
+            missed[_plain_name(name)] = (
+                "the snapshot has no actor or articulation of this name and shape; left unchanged"
+            )
         if not fitting:
             continue
         carried[_plain_name(name)] = None

@@ -202,7 +202,7 @@ def write_task_state(
             object.__setattr__(walk.owners[owner], name, value)
             carried[path] = None
         else:
-            missed[path] = "the task has none of this name now"
+            missed[path] = "the task no longer has an attribute of this name"
     return carried, missed
 
 

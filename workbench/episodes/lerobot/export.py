@@ -369,10 +369,10 @@ def _difference(one: dict[str, dict], other: dict[str, dict]) -> str:
         if key not in other:
             return f"it has no {key}"
         if key not in one:
-            return f"the first one has no {key}"
+            return f"the first episode has no {key}"
         if one[key] != other[key]:
             part = next(name for name in one[key] if one[key][name] != other[key].get(name))
-            return f"the {part} of {key} is {other[key].get(part)}, and {one[key][part]} in the first one"
+            return f"the {part} of {key} is {other[key].get(part)}, but {one[key][part]} in the first episode"
     return "it has another frame rate"
 
 

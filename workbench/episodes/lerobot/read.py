@@ -277,7 +277,7 @@ def _path_in(folder: Path, path: str) -> Path:
     """Path of a file that the dataset names. Raises ValueError if it is outside the folder."""
     file = (folder / path).resolve()
     if not file.is_relative_to(folder.resolve()):
-        raise ValueError(f"it names the file {path}, which is outside of it")
+        raise ValueError(f"it names the file {path}, which is outside the dataset's folder")
     return file
 
 

@@ -228,7 +228,7 @@ def _maniskill_entries(
         more = clean_text(f"{name}.json does not describe {listed(others)} of {name}.h5.", 500)
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     if count > most:
-        more = f"{name}.json names {count - most:,} more episodes than the {most:,} that are listed per file."
+        more = f"{name}.json names {count:,} episodes; only the first {most:,} are listed."
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     return entries
 

@@ -180,9 +180,9 @@ def _kept(view: SessionView) -> str:
     if view.task is None:
         return "No version has loaded yet. Fix the file and save it, and the page will show it."
     if view.state in ("starting", "loading"):
-        return "A new process is taking over; the version that ran will be back where it was."
+        return "A new process is starting; it restores the version that ran, at the same moment."
     if view.problem is not None and view.problem.stage == "worker":
-        return "The last good version is back where it was, and paused."
+        return "The last good version was restored to its last moment, and is paused."
     if view.problem_at_run:
         if view.problem is not None and view.problem.stage == "policy":
             return "The task is paused. Save a fixed policy, or choose another source of actions (Run tab)."

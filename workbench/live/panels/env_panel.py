@@ -38,13 +38,13 @@ from workbench.page.widgets.visitors import Visitor
 Filter = Literal["all", "failed", "running", "flagged"]
 FILTERS: dict[Filter, tuple[str, str]] = {
     "all": ("all envs", "There is no env."),
-    "failed": ("without success last", "Every env's last episode ended in success."),
+    "failed": ("last episode without success", "Every env's last episode ended in success."),
     "running": ("running", "No env is running."),
     "flagged": ("flagged", "No env is flagged."),
 }
 """Label of the choice, and text of an empty table."""
 FILTER_HINT = (
-    "without success last: the last finished episode ended by fail or at the time limit. "
+    "last episode without success: the last finished episode ended by fail or at the time limit. "
     "flagged: something odd in the current or the previous episode."
 )
 WORDS = {
@@ -262,7 +262,7 @@ def _step(step: int) -> str:
 ROWS_PER_PAGE = 64
 HINTS = {
     "env": "Click a column to sort by it, again to reverse the order",
-    "state": "Of the current episode: running until it first ends",
+    "state": "State of the current episode: running until its first end",
     "steps": "Control steps of the episode",
     "return": "Sum of the rewards of the episode so far",
     "last": "How the previous episode ended, and at which step",

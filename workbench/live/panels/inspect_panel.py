@@ -311,7 +311,7 @@ def inspect_html(
         elif section == "state":
             leaves = leaf_rows(now.state or (), before.state if before else None)
         if view.timeline.shown is not None:
-            note += "; this is live: of past moments only the poses are kept"
+            note += "; these values are live: only poses are kept for past moments"
         if section in ("observation", "state"):
             note += "; numbers that changed since the previous reading are blue"
     return render(

@@ -251,7 +251,9 @@ def said_of(reward: NDArray[np.float32]) -> str:
     if not lost:
         return ""
     rest = (
-        ": every curve has a gap there." if not np.isfinite(reward).any() else "; the mean is of the others."
+        ": every curve has a gap there."
+        if not np.isfinite(reward).any()
+        else "; the mean is over the other envs."
     )
     return (
         f"The reward is {lost} envs{rest}"

@@ -320,7 +320,9 @@ def continue_tools(view: SessionView) -> list[Tool]:
         tool(f"{GO_ON}: {env}", ContinueFromHere()),
         Tool("all envs", ContinueFromHere(scope="all"), "Each from its own moment"),
         Tool(
-            f"{env} into all envs", ContinueFromHere(scope="into all"), "All envs from the moment of this one"
+            f"{env} into all envs",
+            ContinueFromHere(scope="into all"),
+            "All envs continue from this env's shown moment",
         ),
     ]
 

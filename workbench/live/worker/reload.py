@@ -177,7 +177,7 @@ def why_new_process(
     elif at_load:
         reason = f"the version before has changed {some_of(at_load)}"
     else:
-        reason = f"what {gone} did when it was imported cannot be undone"
+        reason = f"the effects of importing {gone} cannot be undone"
     return NewProcessNeeded(reason, same_scene)
 
 
