@@ -260,7 +260,7 @@ class Page:
             )
         with tabs.add_tab(INSPECT, viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, self._open_tabs, clock)
-            self._hands = HandsPanel(server, session, lambda: self._inspect.body)
+            self._hands = HandsPanel(server, session, lambda: self._inspect.body, self._inspect.below_body)
         with tabs.add_tab(TRY, viser.Icon.FLASK):
             self._solve = SolvePanel(server, session, self._open_tabs, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
@@ -312,7 +312,7 @@ class Page:
         panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
         draw_apart(self._server, panels, lambda: self._draw_scene(view))
         self._watch(view)
-        self._hands.follow_pages()
+        self._hands.follow(view)
 
     def _watch(self, view: SessionView) -> None:
         """Request from the session the pictures that the page shows."""

@@ -28,7 +28,7 @@ from workbench.live.view import SessionView
 from workbench.machine.loop import post
 from workbench.page.command import Command, Refused
 from workbench.page.scene.body_pick import box_of_body
-from workbench.page.scene.env_grid import COLOUR, InView, line_set, view_label
+from workbench.page.scene.env_grid import COLOUR, InView, view_label
 from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.notices import refusals_told
@@ -45,7 +45,6 @@ TITLE = "Move"
 GIZMO_PIXELS = 76.0
 MIN_GRIP_METRES = 0.01
 """Minimum side of the box that is dragged, so that a thin body can be hit."""
-PULL_COLOUR = (240, 140, 0)
 HINT = (
     "Drag the body in the view: while the envs play, a spring pulls it; while they are paused, it moves. "
     "Shift+U undoes a move."
@@ -65,6 +64,8 @@ class _Selected:
     """(2, 3) lowest and highest corner in the body's frame."""
     offset: Floats
     """(3,) position of the env in the view."""
+    steps: int
+    """Control steps of the env's episode."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +92,18 @@ class HandsPanel(PagePart[SessionView]):
 
     Args:
         body: returns the name of the selected body; empty for none.
+        order: viser's order of the fold in its tab.
     """
 
     does = (SetBodyPosition, SetBodyAngle, ToggleHandles, ChooseMovedEnvs)
 
-    def __init__(self, server: viser.ViserServer, session: LiveSession, body: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: LiveSession,
+        body: Callable[[], str],
+        order: float | None = None,
+    ) -> None:
         self._server, self._session, self._body = server, session, body
         self._handles_on = self._all_envs = False
         self._selected: _Selected | None = None
@@ -103,7 +111,7 @@ class HandsPanel(PagePart[SessionView]):
         self._offset: Floats = np.zeros(3)
         self._box_of: tuple[int, int, int] | None = None
         self._box: NDArray[np.float32] | None = None
-        self._fold = server.gui.add_folder(TITLE, visible=False)
+        self._fold = server.gui.add_folder(TITLE, order=order, visible=False)
         with self._fold:
             self._note = server.gui.add_html("", visible=False)
             self._position = self._row("Position", SetBodyPosition, XYZ, "In the env's frame, metres.", 0.01)
@@ -123,7 +131,6 @@ class HandsPanel(PagePart[SessionView]):
             "/hands/gizmo", GIZMO_PIXELS, fixed=True, depth_test=False, visible=False
         )
         self._gizmo.on_update(self._on_gizmo)
-        self._spring = line_set(server, "/hands/spring", PULL_COLOUR, 3.0)
         self._force = view_label(server, "/hands/force", "bottom-left")
 
     def _row(self, label: str, kind: type[Command], parts: Sequence[str], hint: str, step: float) -> Field:
@@ -188,9 +195,13 @@ class HandsPanel(PagePart[SessionView]):
         envs = range(view.task.num_envs) if self._all_envs and view.task is not None else (of.env,)
         self._session.happen(BodyMoved(of.body, tuple(envs), tuple(map(float, pose))))
 
-    def follow_pages(self) -> None:
-        """Let go of what a page drags that was closed."""
-        if self._drag is not None and self._drag.client not in self._server.get_clients():
+    def follow(self, view: SessionView) -> None:
+        """Let go if the page that drags has closed, or if the pulled env was reset."""
+        drag = self._drag
+        if drag is None:
+            return
+        closed = drag.client not in self._server.get_clients()
+        if closed or (drag.how == "pull" and _steps(view, drag.of.env) < drag.of.steps):
             self._let_go()
 
     # --- the 3-D view --------------------------------------------------------------------------------
@@ -207,7 +218,7 @@ class HandsPanel(PagePart[SessionView]):
         return moved
 
     def draw_in_view(self, view: SessionView, poses: NDArray[np.float32], offset: Floats) -> None:
-        """Draw the grip at the selected body, the handles, and the spring of a pull.
+        """Draw the grip at the selected body, the handles, and the force of a pull.
 
         Args:
             poses: (N, B, 7), as `moved` returns them.
@@ -228,7 +239,7 @@ class HandsPanel(PagePart[SessionView]):
         if known is not None and self._drag is None:
             self._gizmo.position = tuple((known.pose[:3] + offset).tolist())
             self._gizmo.wxyz = tuple(known.pose[3:].tolist())
-        self._draw_spring(view, known)
+        self._draw_force(view)
 
     def _find(self, view: SessionView, poses: NDArray[np.float32]) -> _Selected | None:
         task, body, env = view.task, self._body(), view.selected_env
@@ -243,19 +254,16 @@ class HandsPanel(PagePart[SessionView]):
         pose = poses[env, row].astype(np.float64)
         if box is None or not np.isfinite(pose).all():
             return None
-        return _Selected(body, task.geometry.body_kinds[row], env, pose, box, self._offset)
+        return _Selected(body, task.geometry.body_kinds[row], env, pose, box, self._offset, _steps(view, env))
 
-    def _draw_spring(self, view: SessionView, known: _Selected | None) -> None:
+    def _draw_force(self, view: SessionView) -> None:
+        """Label the end of the arrow that viser draws during a drag with the spring's force."""
         drag, pulled = self._drag, view.pulled
-        if drag is None or drag.how == "move" or known is None or known.body != drag.of.body:
-            self._spring.draw()
+        if drag is None or drag.how == "move":
             self._force.draw()
             return
-        at = SO3(known.pose[3:]).apply(drag.grabbed) + known.pose[:3] + known.offset
-        end = drag.target + known.offset
-        self._spring.draw(np.stack([at, end])[None].astype(np.float32))
         newtons = pulled.newtons if pulled is not None and pulled.body == drag.of.body else 0.0
-        self._force.draw(f"{newtons:.3g} N", tuple(end.tolist()))
+        self._force.draw(f"{newtons:.3g} N", tuple((drag.target + drag.of.offset).tolist()))
 
     # --- dragging ------------------------------------------------------------------------------------
 
@@ -346,6 +354,10 @@ class HandsPanel(PagePart[SessionView]):
         drag, self._drag = self._drag, None
         if drag is not None and drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))
+
+
+def _steps(view: SessionView, env: int) -> int:
+    return 0 if view.step is None else int(view.step.elapsed_steps[env])
 
 
 def _with_pose(drag: _Drag, pose: Floats) -> _Drag:

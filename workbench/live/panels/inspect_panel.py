@@ -174,6 +174,8 @@ class InspectPanel(PagePart[SessionView]):
         self.hovered = ""
         """Name of the body on whose row the pointer is; empty for none."""
         self._of_body = server.gui.add_html("", visible=False)
+        self.below_body = self._of_body.order + 0.5
+        """viser's order of what belongs to the selected body."""
         self._show = choice(
             server,
             "Show",
