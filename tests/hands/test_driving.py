@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from tests.drive.session import live_session, start_over, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import ToggleDriving
-from workbench.hands.drive_panel import quarter_turns
+from workbench.hands.drive_panel import yaw_of
 from workbench.hands.driving import KEYS, PAIRS, bindings, driven_action
 from workbench.hands.state import Driven, Hands
 from workbench.live.commands import PauseRun, UseControlMode
@@ -29,38 +29,47 @@ PANDA = (*ARM, ActionDimension("gripper/finger", -1.0, 1.0, zero_holds=False))
 FLANGE = "panda/panda_hand"
 
 
-@given(st.sets(st.sampled_from(KEYS)), st.integers(0, 3))
-def test_values_are_within_the_bounds_and_opposite_keys_cancel(keys: set[str], turns: int) -> None:
-    dimensions, values = driven_action(PANDA, keys, turns)
+@given(st.sets(st.sampled_from(KEYS)), st.floats(-math.pi, math.pi))
+def test_values_are_within_the_bounds_and_opposite_keys_cancel(keys: set[str], yaw: float) -> None:
+    dimensions, values = driven_action(PANDA, keys, yaw)
     assert dimensions == tuple(range(6))
     assert all(PANDA[k].low <= value <= PANDA[k].high for k, value in zip(dimensions, values, strict=True))
     both = {key for pair in PAIRS for key in pair}
-    assert not any(driven_action(PANDA, both, turns)[1])
-    assert not any(driven_action(PANDA, (), turns)[1])
+    assert not any(driven_action(PANDA, both, yaw)[1])
+    assert not any(driven_action(PANDA, (), yaw)[1])
 
 
-@pytest.mark.parametrize(("turns", "x", "y"), [(0, 2.0, 0.0), (1, 0.0, 2.0), (2, -1.0, 0.0), (3, 0.0, -1.0)])
-def test_w_moves_away_from_the_person(turns: int, x: float, y: float) -> None:
-    assert driven_action(PANDA, ("w",), turns)[1][:2] == (x, y)
+@pytest.mark.parametrize(
+    ("key", "yaw", "x", "y"),
+    [
+        ("w", 0.0, 2.0, 0.0),
+        ("w", math.pi / 2, 0.0, 2.0),
+        ("w", math.pi, -1.0, 0.0),
+        ("d", math.pi, 0.0, 2.0),
+        ("a", 0.0, 0.0, 2.0),
+        ("w", math.pi / 4, 2.0 * math.sqrt(0.5), 2.0 * math.sqrt(0.5)),
+    ],
+)
+def test_keys_move_an_end_effector_as_the_person_sees_it(key: str, yaw: float, x: float, y: float) -> None:
+    assert driven_action(PANDA, (key,), yaw)[1][:2] == pytest.approx((x, y), abs=1e-9)
 
 
 def test_the_view_decides_no_other_number_than_x_and_y() -> None:
     joints = tuple(ActionDimension(f"arm/joint{k}", -1.0, 1.0) for k in range(9))
-    assert {driven_action(joints, ("w",), turns)[1] for turns in range(4)} == {(1.0, 0, 0, 0, 0, 0, 0)}
+    assert {driven_action(joints, ("w",), yaw)[1] for yaw in (0.0, 1.0, 2.0)} == {(1.0, 0, 0, 0, 0, 0, 0)}
     absolute = tuple(ActionDimension(one.name, -1.0, 1.0, zero_holds=False) for one in joints)
     assert not bindings(absolute)
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-1.2, 1.2))
-def test_quarter_turns_are_those_of_the_camera(yaw: float, pitch: float) -> None:
+def test_the_yaw_is_that_of_the_camera(yaw: float, pitch: float) -> None:
     """A camera of viser looks along its z axis, with x to the right and y down."""
     ahead = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     matrix = np.stack([right, np.cross(ahead, right), ahead], axis=1)
     from viser.transforms import SO3
 
-    turns = quarter_turns(SO3.from_matrix(matrix).wxyz)
-    assert math.cos(yaw - turns * math.pi / 2) > math.cos(math.pi / 4 + 1e-6)
+    assert math.cos(yaw - yaw_of(SO3.from_matrix(matrix).wxyz)) == pytest.approx(1.0)
 
 
 @pytest.fixture(scope="module")

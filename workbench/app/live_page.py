@@ -234,7 +234,8 @@ class Page:
         with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
             self._hints = add_hints(server)
             self._run = RunPanel(server, session)
-            drive = DrivePanel(server, session)
+            with self._run.actions:
+                drive = DrivePanel(server, session, self._run.below_mode)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
             self._view_panel = ViewPanel(server, dark, self._view_choice)

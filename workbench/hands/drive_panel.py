@@ -22,13 +22,17 @@ from workbench.page.widgets.visitors import Visitor
 
 
 class DrivePanel(PagePart[SessionView]):
-    """The button *Drive by keys*, and what each key does while a person drives."""
+    """The button *Drive by keys*, and what each key does while a person drives.
+
+    Args:
+        order: viser's order in its folder.
+    """
 
     does = (DriveRobot,)
 
-    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+    def __init__(self, server: viser.ViserServer, session: LiveSession, order: float) -> None:
         self._session = session
-        self._html = server.gui.add_html("")
+        self._html = server.gui.add_html("", order=order)
 
     def key(self, view: SessionView) -> object:
         return view.of(Hands).driving, view.task_serial, view.selected_env
@@ -50,7 +54,7 @@ class DrivePanel(PagePart[SessionView]):
         match command:
             case DriveRobot(keys=keys):
                 known = tuple(key for key in keys if key in KEYS)
-                self._session.happen(Driven(known, quarter_turns(visitor.client.camera.wxyz)))
+                self._session.happen(Driven(known, yaw_of(visitor.client.camera.wxyz)))
 
 
 class DrivingSign(PagePart[SessionView]):
@@ -75,15 +79,15 @@ class DrivingSign(PagePart[SessionView]):
             )
 
 
-def quarter_turns(wxyz: Sequence[float] | np.ndarray) -> int:
-    """Quarter turns to the left, seen from above, from the x axis to where a camera of the page looks.
+def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
+    """Angle in radians from the x axis to where a camera of the page looks, to the left, seen from above.
 
     Args:
         wxyz: the camera's orientation, looking along its z axis.
     """
     w, x, y, z = wxyz
     ahead = 2 * (x * z + w * y), 2 * (y * z - w * x)
-    return round(float(np.arctan2(ahead[1], ahead[0])) / (np.pi / 2)) % 4
+    return float(np.arctan2(ahead[1], ahead[0]))
 
 
 def _rows(bound: Sequence[Binding], has_gripper: bool) -> list[tuple[str, str]]:

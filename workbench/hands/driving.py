@@ -54,23 +54,24 @@ def gripper(dimensions: Sequence[ActionDimension]) -> tuple[tuple[int, float, fl
 
 
 def driven_action(
-    dimensions: Sequence[ActionDimension], keys: Collection[str], turns: int
+    dimensions: Sequence[ActionDimension], keys: Collection[str], yaw: float
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """The numbers to set, and their values, while these keys are held.
 
     Args:
-        turns: quarter turns to the left of the person's view, seen from above, against the x axis. With them
-            ``w`` moves an end effector away from the person.
+        yaw: where the person looks: the angle from the x axis to the left, seen from above, in radians. ``w``
+            moves an end effector in this direction, away from the person.
     """
     bound = bindings(dimensions)
     amounts = np.array([(one.raises in keys) - (one.lowers in keys) for one in bound], float)
     axes = [one.name.rpartition("/")[2] for one in bound[:2]]
     if axes == ["x", "y"]:
         ahead, left = amounts[:2]
-        cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns % 4]
+        cos, sin = np.cos(yaw), np.sin(yaw)
         amounts[:2] = cos * ahead - sin * left, sin * ahead + cos * left
     values = [
-        amount * (one.high if amount > 0 else -one.low) for amount, one in zip(amounts, bound, strict=True)
+        min(abs(amount), 1.0) * (one.high if amount > 0 else one.low)
+        for amount, one in zip(amounts, bound, strict=True)
     ]
     return tuple(one.dimension for one in bound), tuple(map(float, values))
 

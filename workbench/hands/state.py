@@ -44,7 +44,7 @@ class Driven:
     """A page reports the driving keys that are held."""
 
     keys: tuple[str, ...]
-    turns: int
+    yaw: float
     """See `driven_action`."""
 
 
@@ -84,10 +84,10 @@ def apply(hands: Hands, event: object, run: Run) -> Change:
     match event:
         case Asked(command=ToggleDriving()):
             return _stop(hands) if hands.driving else _start(hands, run)
-        case Driven(keys=keys, turns=turns) if hands.driving:
-            return _drive(replace(hands, number=hands.number + 1), run, keys, turns)
+        case Driven(keys=keys, yaw=yaw) if hands.driving:
+            return _drive(replace(hands, number=hands.number + 1), run, keys, yaw)
         case DrivingDue(number=hands.number) if hands.driving and hands.keys:
-            return _drive(hands, run, (), 0)
+            return _drive(hands, run, (), 0.0)
         case SettingsChanged(values={"action_source": source}) if hands.driving and source != "sliders":
             return replace(hands, driving=False, keys=()), []
         case VersionLoaded() if hands.driving and (run.task is None or not bindings(run.task.actions)):
@@ -122,10 +122,10 @@ def _stop(hands: Hands) -> Change:
     return replace(hands, driving=False, keys=()), [Then(back)]
 
 
-def _drive(hands: Hands, run: Run, keys: tuple[str, ...], turns: int) -> Change:
+def _drive(hands: Hands, run: Run, keys: tuple[str, ...], yaw: float) -> Change:
     if run.task is None:
         return hands, []
-    dimensions, values = driven_action(run.task.actions, keys, turns)
+    dimensions, values = driven_action(run.task.actions, keys, yaw)
     closes = hands.closes ^ (GRIPPER_KEY in keys and GRIPPER_KEY not in hands.keys)
     if closes != hands.closes:
         grips = gripper(run.task.actions)

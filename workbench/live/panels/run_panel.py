@@ -139,7 +139,7 @@ class RunPanel(PagePart[SessionView]):
         self._session = session
         gui = server.gui
 
-        with gui.add_folder("Actions"):
+        with gui.add_folder("Actions") as self.actions:
             self._source = choice(
                 server, "Source", ChooseActions, "source", SOURCES, "hold", hint=SOURCE_HINT
             )
@@ -147,6 +147,8 @@ class RunPanel(PagePart[SessionView]):
                 tools_html([Tool(TO_TRY, ShowTab(tab="Try"), "Open the Try tab")])
             )
             self._mode = choice(server, "Control", UseControlMode, "mode", (), "", hint=MODE_HINT)
+            self.below_mode = self._mode.order + 0.5
+            """viser's order of what comes after the control mode, in `actions`."""
             self._policy = Field(
                 server,
                 "Policy",

@@ -119,6 +119,11 @@ class Field:
         return self._names[0]
 
     @property
+    def order(self) -> float:
+        """viser's order of the last of its elements."""
+        return self._shown.order
+
+    @property
     def visible(self) -> bool:
         return self._input.visible
 
