@@ -1,0 +1,61 @@
+"""Driving with the real keyboard in a real Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.drive.desk import Desk
+from tests.drive.page import page_on
+from tests.drive.waiting import until
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
+    arguments = ("--num-envs", "2", "--env", "render_backend=none")
+    with page_on(task_file, *arguments, browser=browser) as (page, errors, opened):
+        yield Desk(page, errors, task_file, opened)
+        assert not errors
+
+
+def choose(desk: Desk, label: str, option: str, of: str = "") -> None:
+    desk.page.locator(f"select[name*='{of or label}']").select_option(label=option)
+
+
+def select(desk: Desk, body: str) -> None:
+    desk.tab("Inspect")
+    choose(desk, "Show", "poses", of="choose_inspected")
+    desk.page.get_by_text(body, exact=True).first.click()
+    expect(desk.page.locator(".wb-body b").first).to_have_text(body)
+
+
+def position(desk: Desk) -> list[float]:
+    """Position of the selected body, in metres."""
+    first = desk.page.locator(".wb-body .wb-num").first.inner_text().splitlines()[0]
+    return [float(value) for value in first.removeprefix("p ").split(",")]
+
+
+def test_held_keys_drive_the_hand_and_stop_gives_back(desk: Desk) -> None:
+    desk.tab("Run")
+    choose(desk, "Control", "pd_ee_delta_pose", of="use_control_mode")
+    expect(desk.page.locator(".wb-status")).to_contain_text("pd_ee_delta_pose")
+    select(desk, "panda/panda_hand")
+    before = position(desk)
+    desk.press("k")
+    sign = desk.page.locator(".wb-drives")
+    expect(sign).to_be_visible()
+    desk.page.keyboard.down("e")
+    until(lambda: position(desk)[2] > before[2] + 0.03, "the hand to rise")
+    desk.page.keyboard.up("e")
+    desk.page.wait_for_timeout(700)
+    height = position(desk)[2]
+    desk.page.wait_for_timeout(700)
+    assert position(desk)[2] == pytest.approx(height, abs=0.005), "a released key holds still"
+    sign.get_by_role("button", name="stop").click()
+    expect(sign).to_be_hidden()
+    desk.button("Pause").click()
