@@ -24,6 +24,8 @@ from workbench.envs.inspect_env import list_contacts
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
+from workbench.hands.worker import Hand, move_body
+from workbench.live.messages import MoveBody, PullBody
 
 N = 4
 SEEDS = [40, 41, 42, 43]
@@ -115,6 +117,27 @@ def test_steps_from_one_state_agree_with_the_cpu(picks: tuple[TaskEnv, TaskEnv])
     assert turned.min() > 0.995, "orientations must agree (q and -q are the same)"
     np.testing.assert_allclose(here.reward, there.reward, atol=0.05)  # pyright: ignore
     assert here.elapsed_steps.tolist() == there.elapsed_steps.tolist()  # pyright: ignore
+
+
+def test_a_hand_moves_and_pulls_a_body_of_one_env(picks: tuple[TaskEnv, TaskEnv]) -> None:
+    env, _ = picks
+    before = env.reset(seed=SEEDS).poses
+    cube = scene_index(env.env).names.index("cube")
+    moved = move_body(env, MoveBody("cube", (1,), (0.1, 0.25, 0.3, 1.0, 0.0, 0.0, 0.0), 0))
+    assert moved is not None
+    np.testing.assert_allclose(moved[0].poses[1, cube, :3], [0.1, 0.25, 0.3], atol=1e-5)
+    np.testing.assert_allclose(moved[0].poses[[0, 2, 3]], before[[0, 2, 3]], atol=1e-5)
+    x, y = (float(value) for value in before[2, cube, :2])
+    hand = Hand()
+    hand.take(PullBody("cube", 2, (0.0, 0.0, 0.0), (x, y, 0.2)))
+    for _ in range(25):
+        with hand.pulling(env.env):
+            step = env.step(None)
+    assert 0.15 < step.poses[2, cube, 2] < 0.2 and step.poses[0, cube, 2] < 0.05  # pyright: ignore
+    hand.take(PullBody())
+    with hand.pulling(env.env):
+        env.step(None)
+    assert hand.pulled is None
 
 
 def test_a_snapshot_restores_the_chosen_envs_and_leaves_the_others(picks: tuple[TaskEnv, TaskEnv]) -> None:
