@@ -96,7 +96,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "activity": (view.of(SolveView).activity if starting else view.activity)
         if busy is None
         else _doing(busy),
-        "news": _news(view) if fresh else "",
+        "news": _news(view) if fresh else _pause(view),
         "ago": ago_in_words(view.timeline),
         "can_continue": ContinueFromHere() if view.timeline.can_continue else None,
         "continue_hint": with_key(ContinueFromHere),
@@ -167,6 +167,13 @@ def _doing(busy: Busy) -> str:
     if busy.getting_ready:
         return f"a new worker has been starting for {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
+
+
+def _pause(view: SessionView) -> str:
+    """Why the run paused by itself; empty if it did not."""
+    if view.paused_at is None or view.playing:
+        return ""
+    return f"env {view.selected_env}: {view.pause_when.text}"
 
 
 def _news(view: SessionView) -> str:

@@ -12,6 +12,8 @@ from workbench.live.commands import (
     ChooseActions,
     ChooseClass,
     ChooseEpisodeEnd,
+    ChoosePauseEntry,
+    ChoosePauseTest,
     ChoosePictures,
     Interrupt,
     PauseRun,
@@ -23,6 +25,7 @@ from workbench.live.commands import (
     ResetAll,
     ResetSelected,
     RestartWorker,
+    SetPauseLevel,
     SetPolicy,
     SetSeed,
     SetSpeed,
@@ -119,6 +122,9 @@ DOES: frozenset[type[Command]] = frozenset(
         SetSeed,
         SetSpeed,
         ChooseEpisodeEnd,
+        ChoosePauseEntry,
+        ChoosePauseTest,
+        SetPauseLevel,
         ChooseActions,
         SetPolicy,
         ChoosePictures,
@@ -169,7 +175,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case VersionLoaded():
             return loaded(run, event.loaded, event.on_disk, now)
         case Stepped():
-            return _stepped(run, event), []
+            return _pause_if_due(run, _stepped(run, event), event)
         case Status():
             return _take_status(run, event), []
         case Pictures() | PastPictures():
@@ -257,7 +263,8 @@ def _do_command(run: Run, command: Command) -> Change:
         case PauseRun():
             return _play(run, False)
         case Step():
-            return _set_playing(_show_live(run), False), [Send(SingleStep())]
+            run = replace(_show_live(run), paused_at=None)
+            return _set_playing(run, False), [Send(SingleStep())]
         case ResetAll():
             return _reset(run, None)
         case ResetSelected():
@@ -276,6 +283,12 @@ def _do_command(run: Run, command: Command) -> Change:
             return _change_settings(run, speed=math.inf if speed is None else speed)
         case ChooseEpisodeEnd(rule=rule):
             return _change_settings(run, episode_end=rule)
+        case ChoosePauseEntry(entry=entry):
+            return replace(run, pause_when=replace(run.pause_when, entry=entry)), []
+        case ChoosePauseTest(test=test):
+            return replace(run, pause_when=replace(run.pause_when, test=test)), []
+        case SetPauseLevel(level=level):
+            return replace(run, pause_when=replace(run.pause_when, level=level)), []
         case ChooseActions(source=source):
             # If no policy was named yet, the next step reports that a policy is missing.
             policy = run.named_policy if source == "policy" else None
@@ -346,7 +359,7 @@ def _set_playing(run: Run, playing: bool) -> Run:
 
 
 def _play(run: Run, playing: bool) -> Change:
-    run = _show_live(run) if playing else run
+    run = replace(_show_live(run), paused_at=None) if playing else run
     run = replace(_set_playing(run, playing), plays_asked=run.plays_asked + 1)
     return run, [Send(Play(playing, run.plays_asked))]
 
@@ -435,6 +448,20 @@ def _stepped(run: Run, event: Stepped) -> Run:
         # The task runs again after a problem at run time: it was reset, or the policy changed.
         run = at_rest(with_problem(run, None))
     return run
+
+
+def _pause_if_due(before: Run, run: Run, event: Stepped) -> Change:
+    """Pause at the moment at which `Run.pause_when` holds."""
+    env, joints = run.env, () if run.task is None else run.task.joints
+    if run.paused_at is not None and not run.playing:
+        # The worker made further steps before the pause arrived.
+        return _show(run, None if run.past is None else run.past.seek(run.paused_at)), []
+    if not run.playing or run.step is None or event.step.action is None or env >= len(run.step.reward):
+        return run, []
+    same_episode = before.step is not None and before.step.elapsed_steps[env] < run.step.elapsed_steps[env]
+    if not run.pause_when.holds(before.step if same_episode else None, run.step, env, joints):
+        return run, []
+    return _play(replace(run, paused_at=run.step_serial), False)
 
 
 def _take_status(run: Run, event: Status) -> Run:

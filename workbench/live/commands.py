@@ -128,6 +128,24 @@ class ChooseEpisodeEnd(Command, frozen=True):
     rule: Literal["reset", "continue", "pause"]
 
 
+class ChoosePauseEntry(Command, frozen=True):
+    """Pause when this number of the selected env meets a condition; empty for never."""
+
+    entry: str
+
+
+class ChoosePauseTest(Command, frozen=True):
+    """Choose the condition at which to pause."""
+
+    test: Literal["becomes true", "becomes false", "rises above", "falls below"]
+
+
+class SetPauseLevel(Command, frozen=True):
+    """Set the threshold at which to pause."""
+
+    level: float
+
+
 class ChooseActions(Command, frozen=True):
     """Choose the source of the actions."""
 

@@ -29,6 +29,7 @@ from workbench.live.messages import (
     Settings,
 )
 from workbench.live.past import Past, Strip
+from workbench.live.pause_when import PauseWhen
 from workbench.live.process.heartbeat import Busy, own_files_of
 from workbench.task.description import Pulled, TaskDescription, TaskOptions
 from workbench.task.problem import Problem
@@ -136,6 +137,10 @@ class Run:
     """Why another process restored the version that ran when `problem` occurred; see `TaskFailed.spoiled`."""
     settings: Settings = Settings()
     """Settings chosen on the page."""
+    pause_when: PauseWhen = PauseWhen()
+    """Condition at which the run pauses."""
+    paused_at: int | None = None
+    """Serial of the moment at which the condition held; None once the run has continued."""
     pulled: Pulled | None = None
     """The pull by hand during the newest step."""
     told: NDArray[np.float32] | None = None

@@ -16,6 +16,7 @@ from workbench.envs.step_result import StepResult
 from workbench.live.history.env_table import EnvRows
 from workbench.live.messages import ReloadReport, RulesBroken, Settings
 from workbench.live.past import TimelineView
+from workbench.live.pause_when import PauseWhen
 from workbench.live.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import ProcessMemory
@@ -73,6 +74,10 @@ class SessionView:
     """Why the present version of the file does not run."""
     settings: Settings = Settings()
     """Settings chosen on the page."""
+    pause_when: PauseWhen = PauseWhen()
+    """Condition at which the run pauses."""
+    paused_at: int | None = None
+    """Serial of the moment at which the condition held; None once the run has continued."""
     pulled: Pulled | None = None
     """The pull by hand during the shown step."""
     told: NDArray[np.float32] | None = None

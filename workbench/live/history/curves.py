@@ -136,6 +136,14 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
     return {**found, **terms, **entries, **positions}
 
 
+def columns_by_label(step: StepResult, joints: Sequence[str] = ()) -> dict[str, Column]:
+    """The columns of `columns_of` by a unique label: a reward term and an entry of evaluate may have the same name."""
+    found: dict[str, Column] = {}
+    for column in columns_of(step, joints):
+        found[column.label if column.label not in found else f"{column.group.value} {column.label}"] = column
+    return found
+
+
 def without_curve(step: StepResult) -> tuple[str, ...]:
     """Names of the reward's terms that are not one number per env."""
     there = {column.name for column in columns_of(step) if column.group is Group.TERM}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import viser
 
@@ -13,16 +13,21 @@ from workbench.live.commands import (
     ChooseActions,
     ChooseEpisodeEnd,
     ChooseMoved,
+    ChoosePauseEntry,
+    ChoosePauseTest,
     HoldStill,
     MoveSlider,
     ResetAll,
     ResetSelected,
+    SetPauseLevel,
     SetPolicy,
     SetSeed,
     UseControlMode,
 )
 from workbench.live.events import ActionTold
+from workbench.live.history.curves import columns_by_label
 from workbench.live.messages import EpisodeEnd
+from workbench.live.pause_when import Test
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
@@ -119,6 +124,8 @@ EPISODE_ENDS: dict[str, EpisodeEnd] = {
     "keep running": "continue",
     "pause": "pause",
 }
+NEVER = "never"
+PAUSE_HINT = "Pause at the step at which a number of the selected env meets a condition."
 SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 RESET_ALL, RESET_THIS = "Reset all", "Reset this env"
 TO_TRY = "Options and results of solve"
@@ -164,6 +171,12 @@ class RunPanel(PagePart[SessionView]):
         with gui.add_folder("Episode"):
             self._seed = Field(server, "Seed", SetSeed, "seed", "0", hint="A new seed resets every env.")
             self._end = choice(server, "At the end", ChooseEpisodeEnd, "rule", EPISODE_ENDS, "reset")
+            self._pause = choice(
+                server, "Pause when", ChoosePauseEntry, "entry", {NEVER: ""}, "", hint=PAUSE_HINT
+            )
+            tests = get_args(Test)
+            self._pause_test = choice(server, "It", ChoosePauseTest, "test", tests, tests[0])
+            self._pause_level = Field(server, "Level", SetPauseLevel, "level", 0.0, step=0.1)
             self._resets = gui.add_html("")
 
     def do(self, command: Command, visitor: Visitor) -> None:
@@ -179,6 +192,7 @@ class RunPanel(PagePart[SessionView]):
         self._resets.content = tools_html([tool(name, command, off=not can_act) for name, command in resets])
         self._seed.show(str(view.seed))
         self._end.show(view.settings.episode_end, off=not can_act)
+        self._draw_pause(view)
         self._source.show(view.settings.action_source, off=not can_act)
         modes = control_modes(view)
         self._mode.visible = len(modes) > 1
@@ -195,6 +209,17 @@ class RunPanel(PagePart[SessionView]):
             policy if policy in known else "", options={CHOOSE: "", **{one: one for one in known}}
         )
         self._sliders.draw(view)
+
+    def _draw_pause(self, view: SessionView) -> None:
+        when, joints = view.pause_when, () if view.task is None else view.task.joints
+        known = [] if view.step is None else [*columns_by_label(view.step, joints)]
+        if when.entry and when.entry not in known:
+            known.append(when.entry)
+        self._pause.show(when.entry, options={NEVER: "", **{name: name for name in known}})
+        self._pause_test.show(when.test)
+        self._pause_level.show(when.level)
+        self._pause_test.visible = bool(when.entry)
+        self._pause_level.visible = bool(when.entry) and when.test in ("rises above", "falls below")
 
 
 def control_modes(view: SessionView) -> list[str]:

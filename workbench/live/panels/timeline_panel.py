@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.live.commands import SetSpeed, Step, TogglePlay
 from workbench.live.events import MomentShown
-from workbench.live.history.curves import REWARD, Column, columns_of
+from workbench.live.history.curves import REWARD, Column, columns_by_label
 from workbench.live.history.moments import (
     BY_HAND,
     FAIL,
@@ -400,11 +400,7 @@ def strip_curves(view: SessionView) -> dict[str, Column]:
     """The entries that the strip can show, by name."""
     if view.step is None or view.task is None:
         return {REWARD.label: REWARD}
-    found: dict[str, Column] = {}
-    for column in columns_of(view.step, view.task.joints):
-        # A term and an entry of evaluate may have the same name.
-        found[column.label if column.label not in found else f"{column.group.value} {column.label}"] = column
-    return found
+    return columns_by_label(view.step, view.task.joints)
 
 
 def strip_html(

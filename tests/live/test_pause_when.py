@@ -1,0 +1,85 @@
+"""Pausing at a condition."""
+
+# A session that has a task has a step.
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.scenes import step_of, table_scene
+from tests.drive.session import fake_worker_session
+from workbench.live.commands import ChoosePauseEntry, ChoosePauseTest, PlayRun, SetPauseLevel, Step
+from workbench.live.messages import Play
+from workbench.live.pause_when import PauseWhen, Test
+
+POSES = table_scene(3)[1]
+
+
+@given(st.sampled_from(get_args(Test)), st.floats(width=32), st.floats(width=32), st.floats(-9, 9, width=32))
+def test_a_condition_holds_where_it_becomes_met(test: Test, old: float, new: float, level: float) -> None:
+    when = PauseWhen("height", test, level)
+    before, now = (step_of(POSES, height=np.full(3, value, np.float32)) for value in (old, new))
+    holds = when.holds(before, now, 1)
+    assert holds == (when.is_met(now, 1) and not when.is_met(before, 1))
+    assert when.holds(None, now, 1) == when.is_met(now, 1)
+    assert not (np.isnan(new) and holds)
+    assert not PauseWhen("", test).holds(before, now, 1) and not PauseWhen("gone", test).holds(before, now, 1)
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_the_run_pauses_and_shows_the_step_at_which_the_selected_env_succeeds(
+    tmp_path: Path, late: int
+) -> None:
+    """The worker makes `late` further steps before the pause arrives."""
+    with fake_worker_session(tmp_path) as fake:
+        fake.load()
+        session = fake.session
+        session.change(selected_env=1)
+        session.do(ChoosePauseEntry(entry="success"))
+        session.do(PlayRun())
+        fake.step(2)
+        fake.step(1, success=(0,))
+        assert session.view().playing, "another env succeeded"
+        fake.step(1, success=(0, 1))
+        met = session.view().timeline.last
+        fake.step(late, success=(0, 1)) if late else None
+        view = session.view()
+        assert not view.playing and [request.playing for request in fake.asked(Play)] == [True, False]
+        assert view.step_serial == met and view.paused_at == met
+        session.do(PlayRun())
+        fake.step(3, success=(0, 1))
+        assert session.view().playing, "the condition was met before"
+
+
+def test_single_steps_do_not_pause_and_leave_the_moment(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.load()
+        fake.session.do(ChoosePauseEntry(entry="success"))
+        fake.session.do(Step())
+        fake.step(1, success=(0,))
+        assert fake.session.view().paused_at is None
+        assert fake.session.view().timeline.shown is None
+
+
+def test_a_threshold_is_chosen_with_its_level(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.load()
+        for command in (
+            ChoosePauseEntry(entry="reward"),
+            ChoosePauseTest(test="rises above"),
+            SetPauseLevel(level=0.5),
+            PlayRun(),
+        ):
+            fake.session.do(command)
+        fake.step(1, reward=(0.4, 0.9, 0.9))
+        assert fake.session.view().playing
+        fake.step(1, reward=(0.6, 0.0, 0.0))
+        view = fake.session.view()
+        assert not view.playing and view.pause_when.text == "reward rises above 0.5"
