@@ -358,7 +358,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "warn",
             "_initialize_episode",
             """Masses, limits, damping and drives of joints are set, and bodies are removed, only while the scene
-            is built; no static actor is moved; values that are set have a row for each env that is set.
+            is built; no static actor is moved; a call that sets values gets a row for each env that it changes.
 
             The call raises.
 
@@ -387,7 +387,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             """The task uses nothing that exists for one env only, such as scene.get_contacts() or
             scene.px.raycast().
 
-            The member does not exist in GPU simulation; the workbench opens one env.
+            GPU simulation does not have what the task uses; the workbench opens the task with one env only.
 
             ## Why
             A CPU simulation of one env has members that GPU simulation lacks. A task that uses one of them

@@ -78,7 +78,7 @@ class Project:
         return self._bindings[scope]
 
     def bindings_of(self, file: SourceFile, node: ast.Name) -> list[Binding]:
-        """The bindings that may hold where `node` is read; empty for a builtin or a name of ``import *``."""
+        """The bindings that may be in effect where `node` is read; empty for a builtin or a name from ``import *``."""
         for outer in file.ancestors(node):
             for inside in getattr(outer, "generators", ()):
                 if any(isinstance(n, ast.Name) and n.id == node.id for n in walk(inside.target)):

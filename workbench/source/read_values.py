@@ -438,8 +438,7 @@ def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
         return lambda path, owner: True
 
     def concerns(path: str, owner: str) -> bool:
-        # In a method of `owner`, ``self`` may be an object of `home` or of a subclass only if that class is,
-        # or inherits from, `owner`.
+        # In a method of `owner`, ``self`` can be an object of `cls` only if `cls` is `owner` or inherits from it.
         return any((path, owner) in classes_of(cls) for cls in (home, *_subclasses(home)))
 
     return concerns

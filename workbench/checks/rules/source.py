@@ -399,7 +399,7 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
     The task runs on one of CPU and GPU, and fails on the other.
 
     ## Why
-    A task is written on the CPU and trained on the GPU, or evaluated the other way round. `get_contacts()`
+    Often a task is written on the CPU and trained on the GPU, or trained on one and evaluated on the other. `get_contacts()`
     and the state of a single SAPIEN object exist, or are up to date, in the CPU simulation only; `px.gpu_...`
     and `_gpu_apply_all()` exist in the GPU simulation only. The task runs on one of them, and on the other it
     raises or reads old state.

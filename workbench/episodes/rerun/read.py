@@ -280,7 +280,7 @@ def _plain(values: pa.Array) -> NDArray:
 def read_properties(path: Path) -> dict[str, dict[str, Any]]:
     """The properties of the first recording in `path`, by name and component; several values are a list.
 
-    A library needs only these from a lone ``.rrd``. A truncated file is read up to its end.
+    The library of recordings reads only these from an ``.rrd`` without a ``.json``. A truncated file is read up to its end.
 
     Raises:
         ValueError: `path` holds no recording.

@@ -204,7 +204,8 @@ class WorkerProcess:
         return os.pread(self._stacks, 100_000, 0).decode(errors="replace")
 
     def interrupt(self) -> None:
-        """Raise Interrupted in the author's code if Python runs it (see `Interrupts`), and drop queued control steps."""
+        """Raise Interrupted in the author's code (see `Interrupts`), and drop queued control steps. Native code is not stopped
+        until it returns to Python."""
         with self._wake:
             self._waiting = deque(without_steps(self._waiting))
         if self.beat().number > 0 and self._process.poll() is None:
