@@ -11,6 +11,7 @@ from typing import Any
 import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
+import sapien.physx as physx
 import torch
 
 from tests.drive.envs import PICK_CUBE, batched
@@ -55,6 +56,28 @@ def test_joints_equal_sapiens(pick: TaskEnv) -> None:
         inspect_env(pick, 0, ["joints"]).joints[0].position,
         inspect_env(pick, 1, ["joints"]).joints[0].position,
     )
+
+
+def test_a_bodys_properties_equal_sapiens(pick: TaskEnv) -> None:
+    for env in range(3):
+        cube = maniskill_private.objects_of(pick.env.cube)[env].find_component_by_type(
+            physx.PhysxRigidDynamicComponent
+        )
+        read = inspect_env(pick, env, [], "cube").body
+        assert (read.mass, read.shapes, read.has_gravity) == (cube.mass, ("box",), True)
+        np.testing.assert_array_equal(read.inertia, cube.inertia)
+        np.testing.assert_array_equal(read.velocity, cube.linear_velocity)
+        np.testing.assert_array_equal(read.angular_velocity, cube.angular_velocity)
+        material = cube.collision_shapes[0].physical_material
+        wanted = material.static_friction, material.dynamic_friction, material.restitution
+        assert read.materials == (wanted,)
+    table = inspect_env(pick, 0, [], "table-workspace").body
+    assert table.shapes == ("box",)
+    ground = inspect_env(pick, 0, [], "ground").body
+    assert ground.mass is None and ground.velocity is None and ground.shapes == ("plane",)
+    hand = inspect_env(pick, 0, [], "panda/panda_hand").body
+    assert hand.mass > 0.1 and set(hand.shapes) == {"convex mesh"}
+    assert inspect_env(pick, 0, [], "nothing").body is None and inspect_env(pick, 0, []).body is None
 
 
 def test_contacts_add_up_to_sapiens(pick: TaskEnv) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from workbench.envs import maniskill_private
 from workbench.envs.evaluate_entries import flat_entries
 from workbench.envs.indices import require_env
-from workbench.envs.inspection import Inspection, JointReadings, Leaf, Section, Touching
+from workbench.envs.inspection import BodyReadings, Inspection, JointReadings, Leaf, Section, Touching
 from workbench.envs.scene.scene_index import SceneIndex, scene_index
 from workbench.envs.simulation.cpu_system import batched_system
 from workbench.envs.state_columns import env_states, flat_names, split_flat
@@ -26,8 +26,8 @@ MAX_VALUES = 64
 """Maximum number of values of one array that are sent; a joint vector has fewer, a picture more."""
 
 
-def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
-    """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
+def inspect_env(task: TaskEnv, env: int, sections: Collection[Section], body: str = "") -> Inspection:
+    """Read these sections of one env, and the body of this name; what cannot be read is named in `Inspection.refused`.
 
     The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's
     batched tensors. Reading takes about 1 ms per section for a Panda on a table, and does not change how the
@@ -59,6 +59,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
     return Inspection(
         env=env,
         elapsed_steps=int(task.env.elapsed_steps[env]),
+        body=read_body(task, env, body) if body else None,
         refused=tuple(refused),
         milliseconds=1000 * (time.perf_counter() - began),
         **read,
@@ -140,6 +141,54 @@ def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
         pairs.setdefault(ordered, []).append((contact, 1 if ordered == (first, second) else -1))
     touching = [_touching(bodies, contacts) for bodies, contacts in pairs.items()]
     return tuple(sorted(touching, key=lambda pair: (-float(np.linalg.norm(pair.force)), pair.bodies)))
+
+
+def read_body(task: TaskEnv, env: int, name: str) -> BodyReadings | None:
+    """Physical properties of a body of this env, from SAPIEN's component; None if the env has no such body."""
+    index = scene_index(task.env)
+    entity = index.entities[env, index.names.index(name)] if name in index.names else None
+    component = None if entity is None else entity.find_component_by_type(physx.PhysxRigidBaseComponent)
+    if component is None:
+        return None
+    shapes = component.collision_shapes
+    materials = {
+        (one.static_friction, one.dynamic_friction, one.restitution): None
+        for one in (shape.physical_material for shape in shapes)
+    }
+    moves = isinstance(component, physx.PhysxRigidBodyComponent)
+    state = _state_of(task.env, env, name) if moves else None
+    return BodyReadings(
+        name=name,
+        mass=float(component.mass) if moves else None,
+        inertia=np.asarray(component.inertia, np.float32) if moves else None,
+        centre_of_mass=np.asarray(component.cmass_local_pose.p, np.float32) if moves else None,
+        velocity=None if state is None else state[7:10],
+        angular_velocity=None if state is None else state[10:13],
+        has_gravity=moves and not component.disable_gravity,
+        shapes=tuple(_SHAPES.get(type(shape), type(shape).__name__) for shape in shapes),
+        materials=tuple(materials),
+    )
+
+
+_SHAPES: dict[type, str] = {
+    physx.PhysxCollisionShapeBox: "box",
+    physx.PhysxCollisionShapeSphere: "sphere",
+    physx.PhysxCollisionShapeCapsule: "capsule",
+    physx.PhysxCollisionShapeCylinder: "cylinder",
+    physx.PhysxCollisionShapePlane: "plane",
+    physx.PhysxCollisionShapeConvexMesh: "convex mesh",
+    physx.PhysxCollisionShapeTriangleMesh: "triangle mesh",
+}
+
+
+def _state_of(env: Any, env_idx: int, name: str) -> NDArray[np.float32] | None:
+    """(13,) position, quaternion wxyz, linear and angular velocity of a body; None for a removed body."""
+    index = scene_index(env)
+    slot = env_idx * len(index.names) + index.names.index(name)
+    at = np.flatnonzero(np.asarray(index.slots) == slot)
+    if not len(at):
+        return None
+    return _floats(env.scene.px.cuda_rigid_body_data.torch()[int(index.rows[int(at[0])])])
 
 
 def _touching(bodies: tuple[str, str], contacts: list[tuple[Contact, int]]) -> Touching:

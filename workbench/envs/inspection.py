@@ -66,6 +66,28 @@ class Touching:
 
 
 @dataclass(frozen=True)
+class BodyReadings:
+    """Physical properties and velocities of one body. Of a static body only the shapes and materials are known."""
+
+    name: str
+    mass: float | None
+    """Kilograms."""
+    inertia: NDArray[np.float32] | None
+    """(3,) principal moments, kg m²."""
+    centre_of_mass: NDArray[np.float32] | None
+    """(3,) in the body's frame, metres."""
+    velocity: NDArray[np.float32] | None
+    """(3,) m/s, in the env's own frame."""
+    angular_velocity: NDArray[np.float32] | None
+    """(3,) rad/s, in the env's own frame."""
+    has_gravity: bool
+    shapes: tuple[str, ...]
+    """Kinds of the collision shapes: ``box``, ``convex mesh``."""
+    materials: tuple[tuple[float, float, float], ...]
+    """Distinct materials of the shapes: static friction, dynamic friction, restitution."""
+
+
+@dataclass(frozen=True)
 class Inspection:
     """The requested sections of one env at one moment."""
 
@@ -77,6 +99,8 @@ class Inspection:
     joints: tuple[JointReadings, ...] | None = None
     contacts: tuple[Touching, ...] | None = None
     """Contacts of the last substep, strongest first; after a reset, still those from before the reset."""
+    body: BodyReadings | None = None
+    """The selected body; None if none was requested, or the env has no such body."""
     refused: tuple[tuple[Section, str], ...] = ()
     """Sections that could not be read, each with the reason."""
     milliseconds: float = 0.0

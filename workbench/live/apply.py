@@ -240,8 +240,8 @@ def _apply(run: Run, event: object, now: Now) -> Change:
                 return run, []
             envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx
             return _show_live(run), [Send(SetSliderAction(envs, event.dimensions, event.values))]
-        case ReadingChosen(sections=sections):
-            return replace(run, read_sections=sections), []
+        case ReadingChosen(sections=sections, body=body):
+            return replace(run, read_sections=sections, read_body=body), []
         case ReadingDue():
             return read(run, now)
         case EnvsReset(env_idx=env_idx):

@@ -164,9 +164,10 @@ class ActionTold:
 
 @dataclass(frozen=True)
 class ReadingChosen:
-    """Read these sections of the selected env from now on, while pages are open; empty: stop reading."""
+    """Read these sections and this body of the selected env from now on, while pages are open; empty: stop reading."""
 
     sections: tuple[Section, ...]
+    body: str = ""
 
 
 @dataclass(frozen=True)

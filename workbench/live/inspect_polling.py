@@ -18,7 +18,7 @@ def schedule(run: Run, event: object, now: Now) -> Change:
     """Schedule a reading if `event` made the last reading outdated and no reading is pending."""
     if run.reading != "none" and isinstance(event, Inspection | TaskFailed | VersionLoaded | WorkerDied):
         run = replace(run, reading="none")
-    if run.reading != "none" or not run.read_sections or not run.pages or run.task is None:
+    if run.reading != "none" or not _wanted(run) or not run.pages or run.task is None:
         return run, []
     if run.read_at == _now(run):
         return run, []
@@ -28,11 +28,15 @@ def schedule(run: Run, event: object, now: Now) -> Change:
 
 def read(run: Run, now: Now) -> Change:
     """Request the scheduled reading from the worker."""
-    if run.reading != "soon" or not run.read_sections:
+    if run.reading != "soon" or not _wanted(run):
         return replace(run, reading="none"), []
     asked = replace(run, reading="asked", read_at=_now(run), read_when=now.monotonic)
-    return asked, [Send(Inspect(run.env, run.read_sections))]
+    return asked, [Send(Inspect(run.env, run.read_sections, run.read_body))]
+
+
+def _wanted(run: Run) -> bool:
+    return bool(run.read_sections or run.read_body)
 
 
 def _now(run: Run) -> object:
-    return run.task_serial, run.step_serial, run.env, run.read_sections
+    return run.task_serial, run.step_serial, run.env, run.read_sections, run.read_body

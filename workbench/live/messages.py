@@ -281,6 +281,8 @@ class Inspect:
 
     env: int
     sections: tuple[Section, ...]
+    body: str = ""
+    """Name of a body to read as well; empty for none."""
 
 
 @dataclass(frozen=True)

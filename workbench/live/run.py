@@ -163,6 +163,8 @@ class Run:
     """The newest reading, of the env that was selected then."""
     read_sections: tuple[Section, ...] = ()
     """Sections of the selected env to read again after each step; see `inspect_polling`."""
+    read_body: str = ""
+    """Name of the body that is read with them; empty for none."""
     reading: Literal["none", "soon", "asked"] = "none"
     """``soon``: a reading is scheduled; ``asked``: the worker has not answered the last request yet."""
     read_at: object = None

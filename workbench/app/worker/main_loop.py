@@ -443,7 +443,7 @@ class Worker:
     def _inspect(self, request: Inspect) -> None:
         # The page may have sent this before it knew of a version with fewer envs.
         if self._task.opened is not None and request.env < self._task.opened.env.num_envs:
-            self._line.send(inspect_env(self._task.opened.env, request.env, request.sections))
+            self._line.send(inspect_env(self._task.opened.env, request.env, request.sections, request.body))
 
     def _stop(self, request: Quit) -> None:
         self._quit = True

@@ -253,7 +253,8 @@ class InspectPanel(PagePart[SessionView]):
         is_open = bool(self._tabs.pages_at(TAB))
         shows_contacts = self._tabs.shows(self._forces_on, TAB) or (self.body and is_open)
         needed = {CHOICES[self._chosen] if is_open else None, "contacts" if shows_contacts else None}
-        self._session.happen(ReadingChosen(tuple(section for section in SECTIONS if section in needed)))
+        sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in needed)
+        self._session.happen(ReadingChosen(sections, self.body if is_open else ""))
 
     def _take(self, view: SessionView) -> None:
         new = view.inspection
@@ -357,10 +358,35 @@ def body_html(body: str, view: SessionView, now: Inspection | None) -> str:
         about=f"{geometry.body_kinds[row]}, env {env}",
         pose=poses[0] if poses else None,
         contacts=contacts,
+        facts=body_facts(now, body) if now is not None and now.env == env else [],
         clear=SelectBody(body=""),
         select=lambda name: SelectBody(body=name),
         hover=lambda name: HoverBody(body=name),
     )
+
+
+def body_facts(now: Inspection, body: str) -> list[tuple[str, str]]:
+    """Physical properties of the selected body: name and value with its unit."""
+    read = now.body
+    if read is None or read.name != body:
+        return []
+    facts = []
+    if read.mass is not None and read.inertia is not None and read.centre_of_mass is not None:
+        facts += [
+            ("mass", f"{number_text(read.mass, '.4g')} kg" + ("" if read.has_gravity else ", no gravity")),
+            ("inertia", f"{', '.join(number_text(float(one), '.3g') for one in read.inertia)} kg m²"),
+            ("centre of mass", f"{vector(read.centre_of_mass)} m"),
+        ]
+    if read.velocity is not None and read.angular_velocity is not None:
+        facts.append(("velocity", f"{strength(read.velocity)} m/s, {strength(read.angular_velocity)} rad/s"))
+    counts = {kind: read.shapes.count(kind) for kind in dict.fromkeys(read.shapes)}
+    shapes = ", ".join(f"{count} × {kind}" if count > 1 else kind for kind, count in counts.items())
+    facts.append(("collision", shapes or "none"))
+    for static, dynamic, restitution in read.materials:
+        facts.append(
+            ("friction", f"{static:.3g} static, {dynamic:.3g} dynamic; restitution {restitution:.3g}")
+        )
+    return facts
 
 
 def _reading(now: Inspection, section: Section | None) -> object:
