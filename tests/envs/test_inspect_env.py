@@ -76,7 +76,7 @@ def test_a_bodys_properties_equal_sapiens(pick: TaskEnv) -> None:
     ground = inspect_env(pick, 0, [], "ground").body
     assert ground.mass is None and ground.velocity is None and ground.shapes == ("plane",)
     hand = inspect_env(pick, 0, [], "panda/panda_hand").body
-    assert hand.mass > 0.1 and set(hand.shapes) == {"convex mesh"}
+    assert hand.mass is not None and hand.mass > 0.1 and set(hand.shapes) == {"convex mesh"}
     assert inspect_env(pick, 0, [], "nothing").body is None and inspect_env(pick, 0, []).body is None
 
 
