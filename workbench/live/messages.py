@@ -384,7 +384,7 @@ class Loaded:
     reload: ReloadReport | None = None
     """How the version replaced the previous one; None for the first version of a task. At the levels
     ``same``, ``patched`` and ``cameras``, the scene, the episodes and the poses in `first` are unchanged, and
-    `task` lacks the visuals of the geometry, because they are large."""
+    `task` lacks the shapes of the geometry, because they are large."""
     options: TaskOptions | None = None
     """Options of the `Load`."""
 

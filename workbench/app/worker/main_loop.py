@@ -327,7 +327,7 @@ class Worker:
             self._cameras.update_watched()
             self._cameras.scene_changed()
             # The server already has the meshes: 9 MB for a Panda would add 0.2 s to a reload.
-            unchanged = replace(opened.description.geometry, visuals=())
+            unchanged = replace(opened.description.geometry, visuals=(), collisions=())
             description = replace(opened.description, geometry=unchanged)
             send(Loaded(description, opened.first, opened.milliseconds, report, request.options))
             return
