@@ -29,7 +29,7 @@ from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
 from workbench.hands.drive_panel import DrivePanel, DrivingSign
 from workbench.hands.panel import HandsPanel
-from workbench.live.commands import ChoosePictures
+from workbench.live.commands import ChoosePictures, SetSeed
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
 from workbench.live.panels.banners import Banner, BusyBanner
@@ -522,6 +522,11 @@ class Page:
         ray = np.array(event.ray_origin), np.array(event.ray_direction)
         if (camera := self._frustums.under_ray(*ray)) is not None:
             self._session.happen(CameraChosen(camera))
+            return
+        if (reset := self._hands.reset_under_ray(*ray)) is not None:
+            seed, env = reset
+            self._session.change(selected_env=env)
+            self._session.do(SetSeed(seed=seed))
             return
         alone = self._icons.only_selected or view.task.num_envs == 1
         env = view.selected_env if alone else env_under_ray(layout, *ray)

@@ -21,6 +21,7 @@ from workbench.cameras.state import view_of as studio_view_of
 from workbench.checks.profile import BeginProfile, EndProfile, ProfileJobs
 from workbench.checks.state import BeginCheck, CheckJobs, Checks, ChecksView, EndCheck, KeepCheckAfterSave
 from workbench.envs.recorded_run import RecordedRun
+from workbench.hands.resets import BeginSampling, EndSampling, ResetJobs
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import (
     FileSaved,
@@ -160,6 +161,7 @@ class Session:
         self._plans = PlanJobs(self._happen)
         self._seeds = SeedsJobs(recordings, self._happen)
         self._policies = PolicySearch(self._happen)
+        self._resets = ResetJobs(self._background, self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Created after the parts above, since it reports recovered episodes at once.
@@ -238,6 +240,8 @@ class Session:
                 return self._aside.begin(partial(keep_check_after_save, wanted))
             case BeginProfile() | EndProfile():
                 self._profiles.perform(effect)
+            case BeginSampling() | EndSampling():
+                self._resets.perform(effect)
             case BeginPlan() | EndPlan():
                 self._plans.perform(effect)
             case BeginSeeds() | EndSeeds():
@@ -285,6 +289,7 @@ class Session:
             state.solving.view(run.env),
             studio_view_of(state.studio, run, self._studio.progress),
             state.hands,
+            state.resets,
         )
         return view_of(
             self._run,
@@ -374,6 +379,7 @@ class Session:
         self._past_rescorer.close()
         self._checks.close()
         self._profiles.close()
+        self._resets.close()
         self._plans.close()
         self._seeds.close()
         self._policies.close()

@@ -9,6 +9,7 @@ from workbench.cameras.events import StudioEffect, StudioEvent
 from workbench.cameras.state import Studio
 from workbench.checks import profile as of_profile
 from workbench.checks import state as of_checks
+from workbench.hands import resets as of_resets
 from workbench.hands import state as of_hands
 from workbench.live import apply as of_run
 from workbench.live import policies as of_policies
@@ -36,6 +37,7 @@ SessionEvent = (
     | of_policies.PoliciesListed
     | StudioEvent
     | of_hands.HandEvent
+    | of_resets.ResetsEvent
 )
 Effect = (
     RunEffect
@@ -48,6 +50,7 @@ Effect = (
     | of_solver.SolverEffect
     | of_policies.ListPolicies
     | StudioEffect
+    | of_resets.ResetsEffect
     | Then
 )
 DOES: frozenset[type[Command]] = (
@@ -60,6 +63,7 @@ DOES: frozenset[type[Command]] = (
     | of_solver.DOES
     | of_studio.DOES
     | of_hands.DOES
+    | of_resets.DOES
 )
 """Commands that `apply` handles."""
 
@@ -86,6 +90,8 @@ class State:
     """Policies to choose from, for the action source *policy*."""
     hands: of_hands.Hands = of_hands.Hands()
     """A person who drives the robot."""
+    resets: of_resets.ResetCloud = of_resets.ResetCloud()
+    """Where resets put the bodies."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -105,10 +111,19 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     policies, for_policies = of_policies.apply(state.policies, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
     hands, for_hands = of_hands.apply(state.hands, event, run)
-    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies, hands)
+    resets, for_resets = of_resets.apply(state.resets, event, run)
+    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies, hands, resets)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
     # before the checks, so that the checks run first. Effects of the run come after the jobs: when a load is
     # done, the recording must continue before a recorded run is entered.
-    for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
+    for_jobs = [
+        *for_recording,
+        *for_rescoring,
+        *for_checks,
+        *for_profile,
+        *for_seeds,
+        *for_solver,
+        *for_resets,
+    ]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio, *for_hands]

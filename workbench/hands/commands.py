@@ -34,6 +34,18 @@ class ToggleHandles(Command, frozen=True):
     context = "live"
 
 
+class SampleResets(Command, frozen=True):
+    """Show where resets with other seeds put the selected body."""
+
+    context = "live"
+
+
+class HideResets(Command, frozen=True):
+    """Hide where resets put the selected body."""
+
+    context = "live"
+
+
 class ToggleDriving(Command, frozen=True):
     """Drive the robot of the selected env by keys, or stop driving."""
 
