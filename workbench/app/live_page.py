@@ -65,6 +65,7 @@ from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.body_pick import HOVER_COLOUR, BodyMark, body_under_ray
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.page.scene.frames import BodyFrames
+from workbench.page.scene.task_drawings import TaskDrawingsView
 from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
@@ -211,7 +212,7 @@ class Page:
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._hover_mark = BodyMark(server, "/hovered_body", HOVER_COLOUR)
         self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
-        self._forces = ForceArrows(server)
+        self._forces, self._drawn = ForceArrows(server), TaskDrawingsView(server)
         self._parts.add(TaskCommands(server, visitors))
         kinds = DOES | state.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page", (ENVS_TAB, EPISODES, "Timeline", LOG))
@@ -471,6 +472,7 @@ class Page:
         placed = self._studio.draw_in_view(view, offset)
         self._frustums.draw(task.cameras, pictures, offset, SMALL_METRES if alone else LARGE_METRES, placed)
         self._forces.draw(self._inspect.forces(view), offset)
+        self._drawn.draw(step.drawn, env, offset)
         selected = task.geometry, poses, env, self._inspect.body, offset
         self._body_mark.draw(*selected)
         hovered = self._inspect.hovered if self._inspect.hovered != self._inspect.body else ""

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.envs.task_drawings import Drawing
+
 TERM_PREFIX = "reward_terms/"
 """Prefix of the entries of a `StepResult` that are terms of a dense reward.
 
@@ -67,6 +69,8 @@ class StepResult:
     """(N, J) positions of the joints of `envs.scene.scene_index.joint_names`, in rad or m; None if there are none."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
     """All other entries of ``evaluate()``; no name is also in `evaluate`."""
+    drawn: dict[str, Drawing] = field(default_factory=dict)
+    """What the task drew with `workbench.draw`, by name."""
 
     @property
     def nbytes(self) -> int:
@@ -74,7 +78,9 @@ class StepResult:
         return sum(map(_nbytes, vars(self).values()))
 
 
-def _nbytes(value: Mapping[str, NDArray | OtherEntry] | NDArray | OtherEntry | None) -> int:
+def _nbytes(
+    value: Mapping[str, NDArray | OtherEntry | Drawing] | NDArray | OtherEntry | Drawing | None,
+) -> int:
     if isinstance(value, Mapping):
         return sum(map(_nbytes, value.values()))
     return 0 if value is None else value.nbytes

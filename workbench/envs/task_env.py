@@ -41,6 +41,7 @@ from workbench.envs.snapshots.snapshot import (
 )
 from workbench.envs.step_result import StepResult
 from workbench.envs.strict import StrictMixin
+from workbench.envs.task_drawings import drawings
 from workbench.envs.wrong_options import wrong_option
 
 
@@ -352,6 +353,7 @@ class TaskEnv:
             qpos=read_joints(self.env),
             action=None if action is None else np.array(action, dtype=np.float32),
             sound_obs=_sound(self.obs, count) if look else None,
+            drawn=drawings.of_batch(count) if drawings.on else {},
         )
 
 

@@ -24,6 +24,7 @@ from workbench.envs.action_vector import width
 from workbench.envs.inspect_env import inspect_env
 from workbench.envs.maniskill_private import mark_camera_configs
 from workbench.envs.step_result import StepResult
+from workbench.envs.task_drawings import drawings
 from workbench.envs.task_env import TaskEnv
 from workbench.hands.worker import Hand, move_body
 from workbench.live.messages import (
@@ -160,6 +161,7 @@ class Worker:
     def run(self) -> None:
         """Run until the server sends Quit or closes the connection."""
         self._interrupts.install()
+        drawings.on = True
         self._state_at_start = read_process_state()
         while not self._ends:
             self._heartbeat.begin("idle")
@@ -294,6 +296,7 @@ class Worker:
         with self._start_folder.again():
             self._task.requested_file = named_file(request.task)
         running = self._running
+        drawings.begin_version()
         # A load starts in the initial working directory; if it fails, the working directory of the previous
         # version is restored.
         with self._start_folder.again(stay=True):
@@ -331,6 +334,7 @@ class Worker:
             description = replace(opened.description, geometry=unchanged)
             send(Loaded(description, opened.first, opened.milliseconds, report, request.options))
             return
+        drawings.scene_replaced()
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         if report is None or not report.carried:
             self._chooser.seed(request.options.seed)
