@@ -24,10 +24,12 @@ from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Leaf
 from workbench.envs.keywords import HowMade, Keyword
+from workbench.hands.state import Hands
 from workbench.live.history.curves import Column
 from workbench.live.history.moments import RESET, SUCCESS, EpisodeNumbers
 from workbench.live.messages import ReloadReport, RulesBroken
 from workbench.live.past import Strip, TimelineView
+from workbench.live.pause_when import PauseWhen
 from workbench.live.process.background_jobs import JobProgress
 from workbench.live.process.captured_output import Printed, PrintedLine
 from workbench.live.process.heartbeat import Busy
@@ -179,6 +181,9 @@ CHANGES: dict[str, Any] = {
     "no camera": just(studio=studio(selected=None)),
     "what studio can undo": just(studio=studio(undo="moved base_camera")),
     "a moved mount": just(studio=studio(mount=np.array([0, 1, 0, 1, 0, 0, 0], np.float32))),
+    "a person drives": just(hands=Hands(driving=True)),
+    "a condition to pause at": just(pause_when=PauseWhen("reward", "rises above", 0.5)),
+    "a pause at a condition": just(pause_when=PauseWhen("success"), paused_at=30),
     "a picture": just(pictures=picture(200), pictures_serial=2),
     "a camera that fails": just(failed_cameras={KEY: "It cannot be drawn."}),
 }  # fmt: skip

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from tests.drive.session import live_session, start_over, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import ToggleDriving
+from workbench.hands.drive_keys import KEYS, PAIRS, bindings, driven_action
 from workbench.hands.drive_panel import yaw_of
-from workbench.hands.driving import KEYS, PAIRS, bindings, driven_action
 from workbench.hands.state import Driven, Hands
 from workbench.live.commands import PauseRun, UseControlMode
 from workbench.page.command import Refused

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from workbench.hands.commands import DriveRobot, ToggleDriving
-from workbench.hands.driving import GRIPPER_KEY, KEYS, Binding, bindings, gripper
+from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, Binding, bindings, gripper
 from workbench.hands.state import Driven, Hands
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView

@@ -164,6 +164,10 @@ class HandsPanel(PagePart[SessionView]):
 
     # --- the panel -----------------------------------------------------------------------------------
 
+    def key(self, view: SessionView) -> object:
+        shown = view.step_serial, view.task_serial, view.selected_env, self._body(), id(self._drag)
+        return *shown, self._handles_on, self._all_envs, view.of(ResetCloud).serial
+
     def draw(self, view: SessionView) -> None:
         task, step = view.task, view.step
         poses = None if task is None or step is None else self.moved(task.geometry, step.poses)

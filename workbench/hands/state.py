@@ -7,7 +7,7 @@ from typing import Any
 
 from workbench.actions.sources import ActionSource
 from workbench.hands.commands import ToggleDriving
-from workbench.hands.driving import GRIPPER_KEY, bindings, driven_action, gripper
+from workbench.hands.drive_keys import GRIPPER_KEY, bindings, driven_action, gripper
 from workbench.live.commands import PlayRun
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import Send, SettingsChanged, VersionLoaded
