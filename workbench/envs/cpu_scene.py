@@ -529,7 +529,7 @@ class BatchedCpuMixin:
         note_scene(self)  # type: ignore[arg-type]
 
     def get_info(self) -> dict[str, Any]:
-        # In a reset BaseEnv calls this right after it has reset the controllers of all envs.
+        # During a reset, BaseEnv calls this right after it has reset the controllers of all envs.
         if self._kept_controllers is not None:
             self._kept_controllers.put_back()
         if self._to_begin and not self.scene._needs_fetch:

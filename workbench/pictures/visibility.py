@@ -261,7 +261,8 @@ def measure(
     segmentation gives each pixel's object; one without the robot, to find what the robot covers; and one of
     each object alone, to find what the border cuts and what other things cover. Only the first is slow, since
     the robot's meshes are nearly all of a picture's cost (30 ms with a Panda on a software driver, 2 ms
-    without). An object that the task hides from sensors counts as never drawn for a sensor.
+    without). If the camera is a sensor, an object that the
+    task hides from sensors counts as never drawn.
 
     Args:
         settings: settings of the camera; pixel counts are scaled to its size, since `view` may be smaller.

@@ -140,7 +140,7 @@ def _no_class(module: ModuleType, file: Path, text: str) -> TaskError:
     name = file.name
     if all(not line.strip() or line.lstrip().startswith("#") for line in text.splitlines()):
         return task_error(
-            f"{name} is empty: write a class that inherits BaseEnv into it; `workbench new` writes a minimal one",
+            f"{name} is empty: add a class that inherits BaseEnv; `workbench new` writes a minimal one",
             file,
         )
     imported = [value for value in vars(module).values() if registry.is_task(value)]

@@ -89,8 +89,8 @@ def _override_edit(
     run: RunHooks,
 ) -> SourceEdit:
     """The edit that adds a hook to the task's own class to replace an inherited camera. If the edit is
-    refused, the text to copy is this hook, or only the camera if a function other than a task's camera hook
-    makes the camera. A refused removal has no text to copy."""
+    refused, the user is offered text to copy: the hook, if a camera hook of the task makes the camera; else
+    only the camera's config. A refused removal has no text to copy."""
     if request.settings is None or request.what == "remove":
         raise RefusedEdit(owner_text)
     (kind, _), (_, uid), site = request.key, request.result, info.site

@@ -560,13 +560,16 @@ class History:
         reward = np.full(self.num_envs, np.nan, np.float32)
         terms: dict[str, NDArray[np.float32]] = {}
 
-        def take(then: StepResult, to: Sequence[int] | NDArray, of: Sequence[int] | NDArray) -> None:
-            """Copy rewards and reward terms of the envs `of` in `then` into the envs `to`."""
-            reward[to] = then.reward[of]
-            for name, values in then.evaluate.items():
+        def take(
+            other: StepResult, targets: Sequence[int] | NDArray, sources: Sequence[int] | NDArray
+        ) -> None:
+            """Copy rewards and reward terms of the envs `sources` of another step into the envs `targets`."""
+            reward[targets] = other.reward[sources]
+            for name, values in other.evaluate.items():
                 # evaluate() has no reward terms: only the reward's hook adds them, and it is not called here.
                 if name.startswith(TERM_PREFIX) and name not in step.evaluate:
-                    terms.setdefault(name, np.full(values.shape, np.nan, np.float32))[to] = values[of]
+                    column = terms.setdefault(name, np.full(values.shape, np.nan, np.float32))
+                    column[targets] = values[sources]
 
         kept = np.flatnonzero(~jumped | stepped.resumed)
         if self._moments:
@@ -574,7 +577,7 @@ class History:
             # page's rows below them would move.
             take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
-            # The reward of a state that a hand made is unknown.
+            # The reward of a state in which a person has moved a body is unknown.
             if not restored.moved:
                 take(origin.step, list(restored.env_idx), list(restored.source))
         return replace(step, reward=reward, evaluate={**step.evaluate, **terms})
