@@ -129,3 +129,21 @@ def test_the_handles_are_shown_at_the_body_while_nothing_plays(live_page: Live) 
     assert gizmo.visible
     live_page.show(replace(view, playing=True))
     assert not gizmo.visible
+
+
+@pytest.mark.parametrize(
+    ("body", "playing", "draggable"),
+    [
+        ("cube", False, True),
+        ("cube", True, True),
+        ("table", False, False),
+        ("table", True, False),
+        ("arm/hand", False, False),
+        ("arm/hand", True, True),
+    ],
+)
+def test_only_what_a_drag_would_move_takes_the_gesture_from_the_view(
+    panels: Panels, body: str, playing: bool, draggable: bool
+) -> None:
+    Hands(panels, body, playing)
+    assert bool(panels.nodes("/hands/grip")) == draggable

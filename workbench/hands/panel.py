@@ -255,8 +255,7 @@ class HandsPanel(PagePart[SessionView]):
         """
         self._offset = np.asarray(offset, np.float64)
         known = self._selected = self._find(view, poses)
-        can_drag = known is not None and (known.kind in ("dynamic", "link", "kinematic"))
-        if known is None or not can_drag:
+        if known is None or not _can_be_dragged(known, view):
             self._grip.draw()
         else:
             size = np.maximum(known.box[1] - known.box[0], MIN_GRIP_METRES) * 1.02
@@ -287,7 +286,7 @@ class HandsPanel(PagePart[SessionView]):
         apart = np.linalg.norm(towards - along[..., None] * direction, axis=-1)
         near = np.where((along > 0) & np.isfinite(apart), apart, np.inf)
         batch, env = np.unravel_index(int(near.argmin()), near.shape)
-        if near[batch, env] > POINT_METRES:
+        if near[batch, env] > 2 * POINT_METRES:
             return None
         return cloud.seeds[int(batch)], int(env)
 
@@ -420,6 +419,16 @@ class HandsPanel(PagePart[SessionView]):
         drag, self._drag = self._drag, None
         if drag is not None and drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))
+
+
+def _can_be_dragged(known: _Selected, view: SessionView) -> bool:
+    """Whether a drag moves or pulls the body now. If not, the gesture is the view's: a stray click on a table must not make
+    the next drag move the table."""
+    if view.timeline.shown is not None:
+        return False
+    if view.playing:
+        return not why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu")
+    return known.kind == "dynamic"
 
 
 def spread_text(cloud: ResetCloud, body: int) -> str:
