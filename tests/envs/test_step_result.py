@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 
 from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.envs.task_drawings import Drawing
 
 
 def test_every_field_counts() -> None:
@@ -21,7 +22,8 @@ def test_every_field_counts() -> None:
         "qpos": np.zeros((3, 9), np.float32),
     }
     evaluate, others = {"success": np.zeros(3, bool)}, {"mean": OtherEntry("float", ("0.5",))}
-    assert {one.name for one in fields(StepResult)} == {*arrays, "evaluate", "others"}
-    step = StepResult(**arrays, evaluate=evaluate, others=others)
-    parts = [*arrays.values(), *evaluate.values(), *others.values()]
+    drawn = {"goal": Drawing("points", np.zeros((3, 4, 3), np.float32))}
+    assert {one.name for one in fields(StepResult)} == {*arrays, "evaluate", "others", "drawn"}
+    step = StepResult(**arrays, evaluate=evaluate, others=others, drawn=drawn)
+    parts = [*arrays.values(), *evaluate.values(), *others.values(), *drawn.values()]
     assert step.nbytes == sum(part.nbytes for part in parts)
