@@ -302,9 +302,11 @@ class Page:
         if visitors != self._visitors_counted:
             self._visitors_counted = visitors
             self._session.happen(PagesCounted(visitors))
+            self._hands.follow(self._session.view())
 
     def close(self) -> None:
         """Release the page. The session may continue under another page, and must not render for this one."""
+        self._hands.let_go()
         self.counted(0)
         self._choices.end()
 

@@ -183,12 +183,8 @@ _SHAPES: dict[type, str] = {
 
 def _state_of(env: Any, env_idx: int, name: str) -> NDArray[np.float32] | None:
     """(13,) position, quaternion wxyz, linear and angular velocity of a body; None for a removed body."""
-    index = scene_index(env)
-    slot = env_idx * len(index.names) + index.names.index(name)
-    at = np.flatnonzero(np.asarray(index.slots) == slot)
-    if not len(at):
-        return None
-    return _floats(env.scene.px.cuda_rigid_body_data.torch()[int(index.rows[int(at[0])])])
+    row = scene_index(env).row_of(env_idx, name)
+    return None if row is None else _floats(env.scene.px.cuda_rigid_body_data.torch()[row])
 
 
 def _touching(bodies: tuple[str, str], contacts: list[tuple[Contact, int]]) -> Touching:

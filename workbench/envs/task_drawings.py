@@ -96,4 +96,4 @@ class TaskDrawings:
 
 
 drawings = TaskDrawings()
-"""Those of this process."""
+"""The drawings of this process's task."""

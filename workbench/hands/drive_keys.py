@@ -25,7 +25,7 @@ KEYS = (*(key for pair in PAIRS for key in pair), GRIPPER_KEY)
 
 
 @dataclass(frozen=True)
-class Binding:
+class KeyBinding:
     """The keys of one number of the action."""
 
     dimension: int
@@ -36,11 +36,11 @@ class Binding:
     high: float
 
 
-def bindings(dimensions: Sequence[ActionDimension]) -> tuple[Binding, ...]:
+def bindings(dimensions: Sequence[ActionDimension]) -> tuple[KeyBinding, ...]:
     """The numbers that keys drive: those that zero holds still. Empty for a mode of absolute targets."""
     relative = [(k, one) for k, one in enumerate(dimensions) if one.zero_holds]
     return tuple(
-        Binding(k, one.name, *keys, *_bounds(one)) for keys, (k, one) in zip(PAIRS, relative, strict=False)
+        KeyBinding(k, one.name, *keys, *_bounds(one)) for keys, (k, one) in zip(PAIRS, relative, strict=False)
     )
 
 

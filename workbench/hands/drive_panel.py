@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from workbench.hands.commands import DriveRobot, ToggleDriving
-from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, Binding, bindings, gripper
+from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, KeyBinding, bindings, gripper
 from workbench.hands.state import Driven, Hands
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
@@ -90,7 +90,7 @@ def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
     return float(np.arctan2(ahead[1], ahead[0]))
 
 
-def _rows(bound: Sequence[Binding], has_gripper: bool) -> list[tuple[str, str]]:
+def _rows(bound: Sequence[KeyBinding], has_gripper: bool) -> list[tuple[str, str]]:
     """Keys and what they drive."""
     rows = [(f"{key_in_words(one.raises)} / {key_in_words(one.lowers)}", one.name) for one in bound]
     return [*rows, (key_in_words(GRIPPER_KEY), "open or close the gripper")] if has_gripper else rows

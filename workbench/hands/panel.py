@@ -146,7 +146,7 @@ class HandsPanel(PagePart[SessionView]):
             "points",
         )
         self._drawn_points: tuple[int, int, bytes] | None = None
-        self._grip = InView(partial(self._add_grip), "dimensions", "position", "wxyz")
+        self._grip = InView(self._add_grip, "dimensions", "position", "wxyz")
         self._gizmo = server.scene.add_transform_controls(
             "/hands/gizmo", GIZMO_PIXELS, fixed=True, depth_test=False, visible=False
         )
@@ -231,7 +231,7 @@ class HandsPanel(PagePart[SessionView]):
             return
         closed = drag.client not in self._server.get_clients()
         if closed or (drag.how == "pull" and _steps(view, drag.of.env) < drag.of.steps):
-            self._let_go()
+            self.let_go()
 
     # --- the 3-D view --------------------------------------------------------------------------------
 
@@ -337,7 +337,7 @@ class HandsPanel(PagePart[SessionView]):
         start, end = np.array(event.start_position), np.array(event.end_position)
 
         def handle() -> None:
-            with refusals_told(event.client, then=self._let_go):
+            with refusals_told(event.client, then=self.let_go):
                 self.drag(event.client_id, event.phase, start, end)
 
         post(handle)
@@ -392,7 +392,7 @@ class HandsPanel(PagePart[SessionView]):
         """Handle a drag of the handles."""
         if client is None:
             return
-        with refusals_told(client, then=self._let_go):
+        with refusals_told(client, then=self.let_go):
             if phase == "start" or self._drag is None:
                 of = self._required()
                 self._drag = _Drag(client.client_id, "move", of, np.zeros(3), of.pose, of.pose[:3])
@@ -414,7 +414,7 @@ class HandsPanel(PagePart[SessionView]):
         else:
             self._move(drag.pose)
 
-    def _let_go(self) -> None:
+    def let_go(self) -> None:
         """Cancel the drag."""
         drag, self._drag = self._drag, None
         if drag is not None and drag.how == "pull":

@@ -141,14 +141,13 @@ def _spring(env: Any, request: PullBody) -> _Spring | None:
         return None
     body = index.names.index(request.body)
     entity = index.entities[request.env, body]
-    at = np.flatnonzero(np.asarray(index.slots) == request.env * len(index.names) + body)
-    if entity is None or index.kinds[body] not in ("dynamic", "link") or not len(at):
+    row = index.row_of(request.env, request.body)
+    if entity is None or index.kinds[body] not in ("dynamic", "link") or row is None:
         return None
     component = entity.find_component_by_type(physx.PhysxRigidBodyComponent)
     if index.kinds[body] == "link":
         mass = sum(link.mass for link in component.articulation.links)
     else:
         mass = component.mass
-    row = int(index.rows[int(at[0])])
     grabbed, target = (np.array(point, np.float64) for point in (request.grabbed, request.target))
     return _Spring(env.scene.px, component, row, float(mass), grabbed, target)

@@ -49,8 +49,7 @@ class ObjectSummary:
     """Share of the object that the robot covers, averaged over the envs in which the object would be seen
     without the robot."""
     wholly_hidden: float
-    """Of the envs that have the object, the share in which it is not visible but would be without the
-    robot."""
+    """Share of the envs that have the object in which it is not visible but would be without the robot."""
     covered: float
     """Share of the object that things other than the robot cover, averaged over the envs in which the object
     would be in the picture if nothing covered it."""

@@ -73,6 +73,11 @@ class SceneIndex:
     slot_of: dict[int, int]
     """Slot by ``id`` of an entity; `entities` keeps the entities alive, so ids stay valid."""
 
+    def row_of(self, env: int, name: str) -> int | None:
+        """Row of a moving body of this env in ``px.cuda_rigid_body_data``; None if it has none."""
+        at = np.flatnonzero(np.asarray(self.slots) == env * len(self.names) + self.names.index(name))
+        return int(self.rows[int(at[0])]) if len(at) else None
+
     def name_of(self, entity: Any) -> str | None:
         """Body name of an entity or SAPIEN component; None if ManiSkill does not manage it."""
         slot = self.slot_of.get(id(_entity(entity)))

@@ -37,7 +37,7 @@ class Memory(NamedTuple):
     episode_seeds: NDArray[np.int64]
     """(n,) from `maniskill_private.episode_seeds`."""
     rng: dict[str, list[RngState]]
-    """By purpose (``episode``, ``main``): (n,) states of ManiSkill's generators, one per env."""
+    """(n,) states of ManiSkill's generators, one per env, by purpose (``episode``, ``main``)."""
     task: TaskState
     shared_rng: SharedRng
 

@@ -18,8 +18,8 @@ class TaskDrawingsView:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._nodes: dict[str, tuple[tuple[object, ...], list[InView]]] = {}
-        """What each drawing looks like apart from its data, and its nodes, by name."""
+        self._nodes: dict[str, tuple[tuple[object, ...], InView]] = {}
+        """What each drawing looks like apart from its data, and its node, by name."""
         self._shown: dict[str, tuple[int, bytes]] = {}
 
     def draw(self, drawn: Mapping[str, Drawing], env: int, offset: NDArray) -> None:
@@ -44,8 +44,8 @@ class TaskDrawingsView:
             if not len(data):
                 continue
             if name not in self._nodes:
-                self._nodes[name] = looks, [self._node(name, drawing)]
-            (node,) = self._nodes[name][1]
+                self._nodes[name] = looks, self._node(name, drawing)
+            node = self._nodes[name][1]
             if drawing.kind == "frames":
                 node.draw(data[:, 3:], data[:, :3])
             elif drawing.kind == "text":
@@ -55,8 +55,7 @@ class TaskDrawingsView:
             self._shown[name] = shown
 
     def _remove(self, name: str) -> None:
-        for node in self._nodes.pop(name)[1]:
-            node.draw()
+        self._nodes.pop(name)[1].draw()
         self._shown.pop(name, None)
 
     def _node(self, name: str, drawing: Drawing) -> InView:
