@@ -49,7 +49,8 @@ def runs(
     if file.read_text() != text:
         stop_watching(one.session)  # a moment later the watcher would take the file on disk for a save
     files = (str(file), *map(str, beside))
-    one.load(level, file=files[0], source_files=files, source={files[0]: text}, source_hash=text)
+    source = {str(file): text} | {str(module): module.read_text() for module in beside}
+    one.load(level, file=files[0], source_files=files, source=source, source_hash=text)
     one.reset()
     one.asked(object)
 
