@@ -77,6 +77,22 @@ def test_a_bodys_properties_equal_sapiens(pick: TaskEnv) -> None:
     assert ground.mass is None and ground.velocity is None and ground.shapes == ("plane",)
     hand = inspect_env(pick, 0, [], "panda/panda_hand").body
     assert hand.mass is not None and hand.mass > 0.1 and set(hand.shapes) == {"convex mesh"}
+    assert hand.joint is None and table.joint is None, "no joint, or a fixed one"
+    [link] = [
+        one
+        for one in maniskill_private.objects_of(pick.env.agent.robot)[0].links
+        if one.name.endswith("panda_link4")
+    ]
+    joint = inspect_env(pick, 0, [], "panda/panda_link4").body.joint
+    assert (joint.name, joint.kind) == ("panda_joint4", link.joint.type)
+    np.testing.assert_allclose([joint.low, joint.high], link.joint.limits[0], rtol=1e-6)
+    in_view = link.entity_pose.to_transformation_matrix()
+    np.testing.assert_allclose(
+        in_view[:3, :3] @ joint.axis, link.joint.global_pose.to_transformation_matrix()[:3, 0], atol=1e-5
+    )
+    np.testing.assert_allclose(
+        in_view[:3, :3] @ joint.origin + in_view[:3, 3], link.joint.global_pose.p, atol=1e-5
+    )
     assert inspect_env(pick, 0, [], "nothing").body is None and inspect_env(pick, 0, []).body is None
 
 

@@ -28,6 +28,7 @@ from workbench.checks.panel import TAB as CHECKS
 from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
 from workbench.hands.drive_panel import DrivePanel, DrivingSign
+from workbench.hands.look import BodyView
 from workbench.hands.panel import HandsPanel
 from workbench.live.commands import ChoosePictures, SetSeed
 from workbench.live.events import PagesCounted
@@ -262,7 +263,11 @@ class Page:
             )
         with tabs.add_tab(INSPECT, viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, self._open_tabs, clock)
-            self._hands = HandsPanel(server, session, lambda: self._inspect.body, self._inspect.below_body)
+            below = self._inspect.below_body
+            self._hands = HandsPanel(server, session, lambda: self._inspect.body, below)
+            self._body_view = BodyView(
+                server, lambda: self._inspect.body, lambda: self._hands.selected, below - 0.25
+            )
         with tabs.add_tab(TRY, viser.Icon.FLASK):
             self._solve = SolvePanel(server, session, self._open_tabs, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
@@ -270,7 +275,7 @@ class Page:
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
         of_run = self._run, drive, version, options, self._view_panel
-        return [*of_run, self._inspect, self._hands, self._solve, seeds, profile, checks]
+        return [*of_run, self._inspect, self._hands, self._body_view, self._solve, seeds, profile, checks]
 
     def _add_left_dock(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
@@ -464,7 +469,7 @@ class Page:
         if built != self._built:
             self._built = built
             self._scene.build(geometry, self._layout, poses, env if one else None, looks)
-        self._scene.move(poses, self._layout, env if one else None)
+        self._scene.move(self._body_view.without_hidden(geometry, poses), self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
         pictures = self._cameras.shown_pictures(seen) if self._view_choice.frustums else {}
         alone = one or task.num_envs == 1
@@ -480,6 +485,8 @@ class Page:
         hovered = self._inspect.hovered if self._inspect.hovered != self._inspect.body else ""
         self._hover_mark.draw(task.geometry, poses, env, hovered, offset)
         self._hands.draw_in_view(view, poses, offset)
+        read = self._inspect.body_reading(view) if self._view_choice.frames else None
+        self._body_view.draw_in_view(view, poses, offset, read)
         if self._view_choice.frames:
             self._frames.draw(*selected)
         else:

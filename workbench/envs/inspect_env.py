@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from workbench.envs import maniskill_private
 from workbench.envs.evaluate_entries import flat_entries
 from workbench.envs.indices import require_env
-from workbench.envs.inspection import BodyReadings, Inspection, JointReadings, Leaf, Section, Touching
+from workbench.envs.inspection import (
+    BodyReadings,
+    Inspection,
+    JointReadings,
+    Leaf,
+    LinkJoint,
+    Section,
+    Touching,
+)
 from workbench.envs.scene.scene_index import SceneIndex, scene_index
 from workbench.envs.simulation.cpu_system import batched_system
 from workbench.envs.state_columns import env_states, flat_names, split_flat
@@ -167,6 +175,33 @@ def read_body(task: TaskEnv, env: int, name: str) -> BodyReadings | None:
         has_gravity=moves and not component.disable_gravity,
         shapes=tuple(_SHAPES.get(type(shape), type(shape).__name__) for shape in shapes),
         materials=tuple(materials),
+        joint=_joint_of(task.env, env, component),
+    )
+
+
+def _joint_of(env: Any, env_idx: int, component: Any) -> LinkJoint | None:
+    """The joint of a link; None for another body, a root link or a fixed joint."""
+    joint = component.joint if isinstance(component, physx.PhysxArticulationLinkComponent) else None
+    if joint is None or joint.dof == 0:
+        return None
+    # Not SAPIEN's own name, which carries the env's number.
+    name = next(
+        merged.name
+        for articulation in env.scene.articulations.values()
+        for at in np.flatnonzero(np.asarray(maniskill_private.envs_of(articulation)) == env_idx)
+        for own, merged in zip(
+            maniskill_private.objects_of(articulation)[int(at)].active_joints,
+            articulation.active_joints,
+            strict=True,
+        )
+        if own.name == joint.name
+    )
+    low, high = (float(one) for one in joint.limits[0])
+    pose = joint.pose_in_child
+    # SAPIEN's joints move about, or along, the x axis of their frame.
+    axis = pose.to_transformation_matrix()[:3, 0]
+    return LinkJoint(
+        name, joint.type, low, high, np.asarray(pose.p, np.float32), np.asarray(axis, np.float32)
     )
 
 

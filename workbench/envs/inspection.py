@@ -66,6 +66,22 @@ class Touching:
 
 
 @dataclass(frozen=True)
+class LinkJoint:
+    """The joint that moves a link against its parent."""
+
+    name: str
+    kind: str
+    """SAPIEN's type: ``revolute``, ``revolute_unwrapped``, ``prismatic``."""
+    low: float
+    """Lower limit in radians or metres; infinite without a limit."""
+    high: float
+    origin: NDArray[np.float32]
+    """(3,) in the link's frame, metres."""
+    axis: NDArray[np.float32]
+    """(3,) unit vector in the link's frame."""
+
+
+@dataclass(frozen=True)
 class BodyReadings:
     """Physical properties and velocities of one body. Of a static body only the shapes and materials are known."""
 
@@ -85,6 +101,8 @@ class BodyReadings:
     """Kinds of the collision shapes: ``box``, ``convex mesh``."""
     materials: tuple[tuple[float, float, float], ...]
     """Distinct materials of the shapes: static friction, dynamic friction, restitution."""
+    joint: LinkJoint | None = None
+    """Of a link that a joint moves."""
 
 
 @dataclass(frozen=True)

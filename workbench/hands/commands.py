@@ -63,3 +63,36 @@ class ChooseMovedEnvs(Command, frozen=True):
     """Move the body in the selected env, or in all envs."""
 
     all_envs: bool
+
+
+class FrameBody(Command, frozen=True):
+    """Frame the selected body."""
+
+    key = "shift+f"
+    context = "live"
+
+
+class TrackBody(Command, frozen=True):
+    """Let the viewpoint follow the selected body, or stop following."""
+
+    context = "live"
+
+
+class HideBody(Command, frozen=True):
+    """Hide the selected body in the 3D view, or show it; cameras and physics do not change."""
+
+    key = "h"
+    context = "live"
+
+
+class ShowHiddenBodies(Command, frozen=True):
+    """Show all hidden bodies."""
+
+    key = "shift+h"
+    context = "live"
+
+
+class MeasureFrom(Command, frozen=True):
+    """Measure distances from the selected body to the next one that is selected."""
+
+    context = "live"

@@ -57,7 +57,7 @@ HINT = (
 
 
 @dataclass(frozen=True)
-class _Selected:
+class Selected:
     """The selected body in the selected env, as it is drawn."""
 
     body: str
@@ -81,7 +81,7 @@ class _Drag:
 
     client: int
     how: Literal["move", "pull"]
-    of: _Selected
+    of: Selected
     """The body when the drag began."""
     grabbed: Floats
     """(3,) the grabbed point in the body's frame."""
@@ -113,7 +113,8 @@ class HandsPanel(PagePart[SessionView]):
     ) -> None:
         self._server, self._session, self._body = server, session, body
         self._handles_on = self._all_envs = False
-        self._selected: _Selected | None = None
+        self.selected: Selected | None = None
+        """The selected body as it is drawn; None if none is selected, or nothing of it is visible."""
         self._drag: _Drag | None = None
         self._offset: Floats = np.zeros(3)
         self._box_of: tuple[int, int, int] | None = None
@@ -171,7 +172,7 @@ class HandsPanel(PagePart[SessionView]):
     def draw(self, view: SessionView) -> None:
         task, step = view.task, view.step
         poses = None if task is None or step is None else self.moved(task.geometry, step.poses)
-        known = self._selected = None if poses is None else self._find(view, poses)
+        known = self.selected = None if poses is None else self._find(view, poses)
         self._fold.visible = known is not None
         if known is None:
             return
@@ -212,10 +213,10 @@ class HandsPanel(PagePart[SessionView]):
                 pose[3:] = quaternion_from_rpy(*angles)
                 self._move(pose)
 
-    def _required(self) -> _Selected:
-        if self._selected is None:
+    def _required(self) -> Selected:
+        if self.selected is None:
             raise Refused("Select a body first: click it in the view.")
-        return self._selected
+        return self.selected
 
     def _move(self, pose: Floats) -> None:
         """Put the selected body at a pose in the env's frame. Raises `Refused`."""
@@ -254,7 +255,7 @@ class HandsPanel(PagePart[SessionView]):
             offset: (3,) position of the selected env in the view.
         """
         self._offset = np.asarray(offset, np.float64)
-        known = self._selected = self._find(view, poses)
+        known = self.selected = self._find(view, poses)
         if known is None or not _can_be_dragged(known, view):
             self._grip.draw()
         else:
@@ -276,7 +277,7 @@ class HandsPanel(PagePart[SessionView]):
         Args:
             origin, direction: (3,) of the click's ray in the view.
         """
-        cloud, known = self._session.view().of(ResetCloud), self._selected
+        cloud, known = self._session.view().of(ResetCloud), self.selected
         if known is None or self._points.handle is None:
             return None
         points = cloud.of(known.row)[..., :3] + known.offset
@@ -290,7 +291,7 @@ class HandsPanel(PagePart[SessionView]):
             return None
         return cloud.seeds[int(batch)], int(env)
 
-    def _draw_resets(self, cloud: ResetCloud, known: _Selected | None) -> None:
+    def _draw_resets(self, cloud: ResetCloud, known: Selected | None) -> None:
         if known is None or not cloud.poses:
             self._points.draw()
             self._drawn_points = None
@@ -304,7 +305,7 @@ class HandsPanel(PagePart[SessionView]):
         self._points.draw()
         self._points.draw(points[np.isfinite(points).all(axis=1)])
 
-    def _find(self, view: SessionView, poses: NDArray[np.float32]) -> _Selected | None:
+    def _find(self, view: SessionView, poses: NDArray[np.float32]) -> Selected | None:
         task, body, env = view.task, self._body(), view.selected_env
         if task is None or body not in task.geometry.body_names:
             return None
@@ -317,7 +318,7 @@ class HandsPanel(PagePart[SessionView]):
         pose = poses[env, row].astype(np.float64)
         if box is None or not np.isfinite(pose).all():
             return None
-        return _Selected(
+        return Selected(
             body, task.geometry.body_kinds[row], row, env, pose, box, self._offset, _steps(view, env)
         )
 
@@ -421,7 +422,7 @@ class HandsPanel(PagePart[SessionView]):
             self._session.happen(BodyPulled(PullBody()))
 
 
-def _can_be_dragged(known: _Selected, view: SessionView) -> bool:
+def _can_be_dragged(known: Selected, view: SessionView) -> bool:
     """Whether a drag moves or pulls the body now. If not, the gesture is the view's: a stray click on a table must not make
     the next drag move the table."""
     if view.timeline.shown is not None:

@@ -182,7 +182,13 @@ class ClearLog(Command, frozen=True):
 class ChooseInspected(Command, frozen=True):
     """Choose what to inspect in the selected env."""
 
-    what: Literal["nothing", "joints", "contacts", "poses", "observation", "state"]
+    what: Literal["nothing", "joints", "contacts", "bodies", "observation", "state"]
+
+
+class FindBodies(Command, frozen=True):
+    """List the bodies whose name contains this text; empty for all."""
+
+    text: str
 
 
 class SelectBody(Command, frozen=True):

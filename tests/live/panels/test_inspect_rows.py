@@ -109,15 +109,15 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
     expected = {
         "joints": "slide",
         "contacts": "5 N",
-        "poses": "arm/hand",
+        "bodies": "arm/hand",
         "observation": "&lt;script",
         "state": "s</b>",
     }
-    if choice == "poses":
+    if choice == "bodies":
         assert 'data-copy="sapien.Pose(p=[' in own
     if choice in expected:
         assert expected[choice] in own
-        assert choice == "poses" or expected[choice] not in other
+        assert choice == "bodies" or expected[choice] not in other
 
 
 def test_changes_since_the_last_reading_of_the_same_env_are_marked(live_page: Live) -> None:

@@ -12,8 +12,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
-from workbench.live.commands import ChooseInspected, HoverBody, SelectBody, ShowForces
+from workbench.envs.inspection import SECTIONS, BodyReadings, Inspection, JointReadings, Leaf, Section
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.live.commands import ChooseInspected, FindBodies, HoverBody, SelectBody, ShowForces
 from workbench.live.events import ReadingChosen
 from workbench.live.inspect_polling import READ_PERIOD_SECONDS
 from workbench.live.session_protocol import LiveSession
@@ -22,7 +23,7 @@ from workbench.machine.text import number_text
 from workbench.page.command import Command
 from workbench.page.commands import ShownOn
 from workbench.page.scene.env_grid import InView
-from workbench.page.widgets.fields import choice
+from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart
 from workbench.page.widgets.templates import render
@@ -137,12 +138,36 @@ def _code(values: NDArray[np.float32]) -> str:
     return "[" + ", ".join(f"{float(value):.6f}".rstrip("0").rstrip(".") or "0" for value in values) + "]"
 
 
-NOTHING, JOINTS, POSES = "nothing", "joints", "poses"
+_STILL: dict[str, int] = {"dynamic": 0, "kinematic": 2, "static": 3}
+"""Order of the kinds of bodies in a list; articulations are 1. What moves comes first."""
+
+
+def body_groups(
+    geometry: SceneGeometry, poses: NDArray[np.float32], text: str = ""
+) -> list[tuple[str, list[Row]]]:
+    """Rows of the bodies of an env under the name of their articulation, or under their kind.
+
+    Args:
+        poses: (B, 7), NaN for bodies that the env lacks.
+        text: names must contain this, in any case.
+    """
+    groups: dict[str, list[int]] = {}
+    for row, (name, kind) in enumerate(zip(geometry.body_names, geometry.body_kinds, strict=True)):
+        if text.casefold() in name.casefold():
+            groups.setdefault(name.partition("/")[0] if kind == "link" else kind, []).append(row)
+    listed = [
+        (name, pose_rows([geometry.body_names[row] for row in rows], poses[rows]))
+        for name, rows in sorted(groups.items(), key=lambda group: _STILL.get(group[0], 1))
+    ]
+    return [(name, rows) for name, rows in listed if rows]
+
+
+NOTHING, JOINTS, BODIES = "nothing", "joints", "bodies"
 CHOICES: dict[str, Section | None] = {
     NOTHING: None,
     JOINTS: "joints",
     "contacts": "contacts",
-    POSES: None,
+    BODIES: None,
     "observation": "observation",
     "state": "state",
 }
@@ -157,7 +182,7 @@ class InspectPanel(PagePart[SessionView]):
         tabs: The open tab of each page.
     """
 
-    does = (ChooseInspected, SelectBody, HoverBody, ShowForces)
+    does = (ChooseInspected, FindBodies, SelectBody, HoverBody, ShowForces)
 
     def __init__(
         self,
@@ -194,6 +219,11 @@ class InspectPanel(PagePart[SessionView]):
             self._forces_on,
             hint="Draw the contact forces of the selected env as arrows in the 3D view.",
         )
+        self._found = ""
+        """Text that the names of listed bodies contain."""
+        self._find = Field(
+            server, "Find", FindBodies, "text", "", hint="A part of a body's name.", live=True, longest=100
+        )
         self._handle = server.gui.add_html("")
         self._now: Inspection | None = None
         self._before: Inspection | None = None
@@ -205,20 +235,25 @@ class InspectPanel(PagePart[SessionView]):
         self._forces.show(self._forces_on)
         self._take(view)
         no_step = self._no_step_yet(view)
-        wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step, self.body)
-        if chosen == POSES or self.body:
+        self._find.visible = chosen == BODIES
+        self._find.show(self._found)
+        asked = chosen, self.body, self._found
+        wanted = (asked, view.task_serial, view.selected_env, id(self._now), no_step)
+        if chosen == BODIES or self.body:
             wanted = (*wanted, view.step_serial)
-        if not self._due.is_due(wanted, urgent=(chosen, self.body)):
+        if not self._due.is_due(wanted, urgent=asked):
             return
         content = body_html(self.body, view, None if no_step else self._now)
         self._of_body.content, self._of_body.visible = content, bool(content)
-        self._handle.content = inspect_html(chosen, view, self._now, self._before, no_step)
+        self._handle.content = inspect_html(chosen, view, self._now, self._before, no_step, self._found)
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
             case ChooseInspected(what=what):
                 self._chosen = what
                 self.choose_sections()
+            case FindBodies(text=text):
+                self._found = text
             case SelectBody(body=body):
                 self.select(body)
             case HoverBody(body=body):
@@ -226,6 +261,11 @@ class InspectPanel(PagePart[SessionView]):
             case ShowForces(where=where):
                 self._forces_on = where
                 self.choose_sections()
+
+    def body_reading(self, view: SessionView) -> BodyReadings | None:
+        """The reading of the selected body in the selected env, live; None if there is none."""
+        here = self._now is not None and self._now.env == view.selected_env
+        return self._now.body if self._now is not None and here and view.timeline.shown is None else None
 
     def forces(self, view: SessionView) -> Inspection | None:
         """The reading whose contacts the 3-D view shows. None to show no contacts, for example at a past
@@ -274,27 +314,31 @@ def inspect_html(
     now: Inspection | None,
     before: Inspection | None,
     no_step_yet: bool = False,
+    found: str = "",
 ) -> str:
     """The tab's content.
 
     Args:
         no_step_yet: the env has made no step since it was reset or restored: leave out contacts.
+        found: text that the names of listed bodies contain.
     """
-    leaves, articulations, contacts, poses = [], [], (), []
+    leaves, articulations, contacts, groups = [], [], (), []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
     if view.task is None or view.step is None:
         note = "There is nothing to inspect until the task has loaded."
     elif choice == NOTHING:
         note = (
-            "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "
+            "Choose what to read of the selected env: its joints, contacts, bodies with their poses, the observation "
             "or the simulation state. Nothing is read until then."
         )
-    elif choice == POSES:
-        names = view.task.geometry.body_names
-        if view.step.poses.shape[:2] == (view.task.num_envs, len(names)):
-            poses = pose_rows(names, view.step.poses[env])
+    elif choice == BODIES:
+        geometry = view.task.geometry
+        if view.step.poses.shape[:2] == (view.task.num_envs, len(geometry.body_names)):
+            groups = body_groups(geometry, view.step.poses[env], found)
         note = f"env {env}: metres, quaternions w x y z, in the env's own frame"
+        if found and not groups:
+            note = f"No body of env {env} has {found!r} in its name."
     elif now is None or now.env != env or _reading(now, section) is None:
         refused = dict(now.refused) if now is not None and now.env == env else {}
         note = refused.get(section, f"Reading env {env} ...") if section else ""
@@ -323,7 +367,7 @@ def inspect_html(
         leaves=leaves,
         articulations=articulations,
         contacts=contacts,
-        poses=poses,
+        groups=groups,
         select=lambda name: SelectBody(body=name),
         hover=lambda name: HoverBody(body=name),
         vector=vector,
@@ -386,6 +430,11 @@ def body_facts(now: Inspection, body: str) -> list[tuple[str, str]]:
         facts.append(
             ("friction", f"{static:.3g} static, {dynamic:.3g} dynamic; restitution {restitution:.3g}")
         )
+    if (joint := read.joint) is not None:
+        unit = "m" if joint.kind == "prismatic" else "rad"
+        limited = math.isfinite(joint.low) and math.isfinite(joint.high)
+        limits = f"{number(joint.low)} to {number(joint.high)} {unit}" if limited else "no limits"
+        facts.append(("joint", f"{joint.name}, {joint.kind.removesuffix('_unwrapped')}, {limits}"))
     return facts
 
 
