@@ -36,6 +36,12 @@ def test_an_unknown_option_is_named_with_the_nearest_existing_one(
         assert name in str(caught.value)
 
 
+@pytest.mark.parametrize("given", [{"sim_freq": 0}, {"control_freq": -20}, {"control_freq": "20"}])
+def test_a_frequency_that_is_not_above_0_is_refused_by_name(given: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(given))} must be a number of Hz above 0"):
+        workbench.make("PickCube-v1", num_envs=2, sim_config=given)
+
+
 def test_an_error_in_the_tasks_constructor_is_reported_as_the_tasks(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text(

@@ -57,6 +57,12 @@ def test_a_film_holds_every_frame_in_order_at_its_rate(tmp_path: Path) -> None:
         assert abs(float(frame.mean()) - 20 * index) < 3
 
 
+def test_a_film_that_a_frame_interrupts_raises_that_error_and_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="shape"):
+        write_mp4(tmp_path / "a.mp4", [*shades(2), *shades(1, width=32)], fps=20)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_full_disk_ends_a_film_with_a_message_and_leaves_no_file(tmp_path: Path) -> None:
     # In a subprocess: an unprivileged process cannot raise its file size limit again.
     noise = (

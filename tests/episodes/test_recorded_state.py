@@ -1,11 +1,11 @@
-"""Distance between two recorded states."""
+"""Distance and equality of two recorded states."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from workbench.episodes.recorded_state import state_distance
+from workbench.episodes.recorded_state import same_state, state_distance
 
 
 def test_the_distance_of_states_is_that_of_the_furthest_body_and_joint() -> None:
@@ -24,3 +24,11 @@ def test_the_distance_of_states_is_that_of_the_furthest_body_and_joint() -> None
 def test_a_controllers_state_is_not_taken_for_a_pose(count: int) -> None:
     name = "controller/arm"
     assert state_distance({name: np.ones(count)}, {name: np.zeros(count)}) == (0, 0)
+
+
+def test_a_state_with_nan_is_the_same_as_itself_and_every_velocity_counts() -> None:
+    was = {"actors/cube": np.arange(13, dtype=np.float32), "actors/gone": np.full(13, np.nan, np.float32)}
+    now = {name: state.copy() for name, state in was.items()}
+    assert same_state(now, was)
+    now["actors/cube"][12] += 1e-6
+    assert not same_state(now, was)

@@ -214,6 +214,19 @@ def test_a_task_whose_bodies_differ_by_env_is_refused_with_their_name() -> None:
     env.close()
 
 
+def test_bodies_that_a_rebuild_changes_are_compared_again(task: Path) -> None:
+    env = workbench.make(task, 1, backend="cpu", render_backend="none")
+    planner = planner_of(env)
+    env.reset(seed=0)
+    planner.actions()
+    cast(Any, env.unwrapped).cube_half_size = 0.05
+    env.reset(seed=0, options={"reconfigure": True})
+    with pytest.raises(NotAlike, match="cube"):
+        planner.actions()
+    planner.close()
+    env.close()
+
+
 def test_several_robots_get_a_dict_of_actions() -> None:
     env = workbench.make(TASKS / "two_robots.py", 1, backend="cpu", render_backend="none")
     planner = planner_of(env)

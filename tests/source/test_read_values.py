@@ -227,6 +227,20 @@ def test_an_attribute_of_an_unrelated_class_is_not_followed() -> None:
     )
 
 
+def test_an_attribute_of_a_class_within_a_function_is_followed() -> None:
+    text = """
+def made():
+    class Rig:
+        def __init__(self):
+            self.height = 1.5
+        def look(self):
+            note(self.height)
+    return Rig()
+made().look()
+"""
+    assert described(text).startswith("1.5 < self.height")
+
+
 def test_a_call_on_a_newly_created_owner_is_not_repeated() -> None:
     text = """\
 made = []

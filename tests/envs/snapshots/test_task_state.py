@@ -192,6 +192,15 @@ def test_batch_wide_attributes_are_restored_only_with_all_envs(env: Any) -> None
     assert env.total_resets == count
 
 
+def test_a_batch_wide_tensor_that_is_written_in_place_is_restored_again_and_again(env: Any) -> None:
+    env.curriculum = torch.zeros(3)
+    snapshot = take_snapshot(env)
+    for _ in range(2):
+        env.curriculum += 1
+        restore_snapshot(env, snapshot)
+        assert env.curriculum.tolist() == [0.0] * 3
+
+
 def test_a_tensor_with_other_references_is_not_written_to(env: Any) -> None:
     env.write(1.0)
     snapshot = take_snapshot(env)

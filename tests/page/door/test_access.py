@@ -93,6 +93,12 @@ def test_an_origin_is_ours_if_scheme_host_and_port_match(host: str, origin: str,
     )
 
 
+def test_a_second_origin_is_refused() -> None:
+    ours = "http://localhost:8080"
+    for origins in ([ours, "http://evil.example"], [ours, ours]):
+        assert why(decide(GATE, replace(KNOWN, origin=origins))) is Why.SITE
+
+
 NAVIGATES, DOCUMENT = {"fetch_mode": ["navigate"]}, {"fetch_dest": ["document"]}
 
 

@@ -93,6 +93,20 @@ def test_many_silent_connections_do_not_lock_out_others(gated_server, monkeypatc
     assert "10 connections are open without the token (from 127.0.0.1)" in caplog.text
 
 
+def test_the_peer_with_the_most_connections_loses_its_oldest(gated_server, monkeypatch):
+    monkeypatch.setattr(strangers, "MAX_WITHOUT_TOKEN", 10)
+    address = "127.0.0.1", gated_server.port
+    with contextlib.ExitStack() as stack:
+        other = stack.enter_context(
+            socket.create_connection(address, timeout=30, source_address=("127.0.0.2", 0))
+        )
+        crowd = [stack.enter_context(connected(gated_server)) for _ in range(20)]
+        assert is_closed(crowd[0])
+        other.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            other.recv(1)
+
+
 @pytest.mark.parametrize(
     "head",
     [

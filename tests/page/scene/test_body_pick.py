@@ -73,6 +73,9 @@ def test_the_mark_is_the_box_of_the_body_at_its_pose(panels: Panels) -> None:
     at = POSES[1, CUBE, :3] + [10, 0, 0]
     np.testing.assert_allclose([low, high], [at - 0.02, at + 0.02], atol=1e-6)
     assert len(edges.points) == 12 and panels.labels() == ["cube"]
+    mark.draw(GEOMETRY, POSES, 1, "arm/hand", np.zeros(3))
+    (edges,) = panels.nodes("/selected_body/box")
+    np.testing.assert_allclose(np.ptp(edges.points.reshape(-1, 3), axis=0), [0.1, 0.1, 0.3], atol=1e-6)
     mark.draw(GEOMETRY, POSES, 1, "no such body", np.zeros(3))
     assert panels.nodes("/selected_body/box") == [] and panels.labels() == []
     box = box_of_body(GEOMETRY, 0, NAMES.index("arm/hand"))
