@@ -1,16 +1,21 @@
-"""The camera that the Studio places, chosen from its list."""
+"""The camera that the Studio places: chosen from its list, and drawn in the view."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import websockets.sync.client
+
 from tests.drive.live import Live
 from tests.drive.scenes import camera, running
+from tests.drive.tabs import camera_message, handshake
+from tests.drive.waiting import until
 from workbench.cameras.commands import ChooseCamera, MoveCameraToView
 from workbench.cameras.events import CameraChosen
 from workbench.cameras.studio_panel import NO_CAMERA, TAB
 from workbench.cameras.view import StudioCamera, StudioView
-from workbench.envs.camera_data import CameraKey
+from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.live.view import SessionView
 
 BASE, PEOPLE = "base_camera · sensor", "base_camera · human view"
@@ -39,3 +44,27 @@ def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
     assert live_page.client.notices == ["There is no camera gone · sensor."]
     live_page.do(MoveCameraToView())
     assert live_page.client.notices[1:] == ["First choose a camera that can be placed."]
+
+
+def test_the_frustum_is_hidden_while_a_page_looks_from_the_cameras_place(live_page: Live) -> None:
+    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+    info = replace(camera("base_camera"), settings=at)
+    placed = StudioView(cameras=(StudioCamera(info.key, info, at, False, None),), selected=info.key)
+    view = running(1, studio=placed)
+    assert view.task is not None
+    view = replace(view, task=replace(view.task, cameras=(info,)))
+    live_page.show(view)
+    assert [node.name for node in live_page.nodes("/cameras/")] == ["/cameras/sensor base_camera"]
+    address, arguments = handshake(f"http://127.0.0.1:{live_page.server.get_port()}")
+    with websockets.sync.client.connect(address, **arguments) as page:
+        for height, seen in ((3.05, False), (3.5, True)):
+            page.send(camera_message((1.0, 2.0, height)))
+            until(
+                lambda height=height: any(
+                    np.allclose(one.camera.position, [1.0, 2.0, height])
+                    for one in live_page.server.get_clients().values()
+                ),
+                "the page's viewpoint",
+            )
+            live_page.show(view)
+            assert bool(live_page.nodes("/cameras/")) is seen, height

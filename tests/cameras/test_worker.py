@@ -19,7 +19,8 @@ import pytest
 from tests.drive.render_device import RENDER_BACKEND, RENDER_DEVICE
 from workbench.app.worker.questions import QUESTIONS
 from workbench.cameras import worker as under_test
-from workbench.cameras.worker import WorkerCameras
+from workbench.cameras.questions import RunCameras
+from workbench.cameras.worker import WorkerCameras, run_cameras
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.live.messages import (
     CameraRequest,
@@ -221,6 +222,19 @@ def test_a_past_step_is_drawn_after_waiting_placements_and_failures_are_sent(des
     assert desk.iterate() == [] and shown(desk.iterate()) == [BASE], (
         "the interrupted picture must be drawn again"
     )
+
+
+def test_hooks_of_an_edited_text_leave_no_attribute_on_the_running_env(opened: OpenedTask) -> None:
+    file, env = str(opened.loaded.file), opened.env.env
+    look = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6]"
+    assert look in opened.loaded.source[file]
+    text = opened.loaded.source[file].replace(
+        look, "self.tried = [0.1, 0, 0.9]\n        pose = sapien_utils.look_at(eye=self.tried"
+    )
+    names = set(vars(env))
+    found = run_cameras(opened, RunCameras(file, {file: text})).cameras[BASE].settings
+    assert found is not None and found.position == pytest.approx((0.1, 0, 0.9))
+    assert set(vars(env)) == names
 
 
 def test_a_moment_is_captured_with_pictures_of_the_given_envs(desk: Desk) -> None:
