@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.utils.structs.pose import Pose
 
@@ -50,6 +51,21 @@ def test_pictures_equal_a_stock_envs_before_and_after_the_mounts_moved(env: Any)
                 "the link's camera did not move"
             )
     assert np.array_equal(ours["beside/depth"], still["beside/depth"])
+
+
+def test_a_camera_that_the_task_moves_reports_its_new_pose(env: Any) -> None:
+    env.reset(seed=[0, 1, 2])
+    camera = env._sensors["beside"].camera
+    (p, q), before = (
+        np.split(camera.get_local_pose()[0].raw_pose[0].numpy(), [3]),
+        camera.get_extrinsic_matrix(),
+    )
+    camera.set_local_pose(sapien.Pose(p + [0.25, 0, 0], q))
+    try:
+        np.testing.assert_allclose(camera.get_local_pose().p, np.tile(p + [0.25, 0, 0], (N, 1)), atol=1e-6)
+        assert not torch.equal(camera.get_extrinsic_matrix(), before)
+    finally:
+        camera.set_local_pose(sapien.Pose(p, q))
 
 
 def test_a_camera_on_an_actor_follows_the_actor_of_its_own_env(env: Any) -> None:

@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.drive.envs import batched
 from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.envs.maniskill_private import camera_components
 from workbench.envs.scene.scene_index import read_poses, scene_index
 from workbench.pictures.camera_conventions import LookAt, compose, pose_from_look_at, relative_to, with_pose
 from workbench.pictures.camera_report import CameraReport, ObjectSeen, join_reports
@@ -188,6 +189,17 @@ def test_depth_reports_background_far_floor_and_suggested_planes(env: Any) -> No
     tighter = in_all_envs(env, Placement(looking(FAR_FLOOR, near=near, far=far)))
     assert_array_equal(seen(tighter, "cube").pixels, seen(report, "cube").pixels)
     assert (tighter.depth.background > depth.background).all()
+
+
+def test_the_present_placement_of_an_env_is_that_of_its_own_camera(env: Any) -> None:
+    component = camera_components(cameras_of(env)[SENSOR])[2]
+    was = component.local_pose
+    component.local_pose = sapien.Pose([0.1, 0.2, 0.9])
+    try:
+        first, last = (placement_of(env, SENSOR, e).settings.position for e in (0, 2))
+    finally:
+        component.local_pose = was
+    assert last == pytest.approx((0.1, 0.2, 0.9)) and first == pytest.approx(tuple(was.p))
 
 
 def test_a_mounted_placement_follows_its_mount_in_every_env(env: Any) -> None:

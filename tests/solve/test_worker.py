@@ -103,6 +103,7 @@ def test_a_plan_is_requested_once_and_dropped_if_something_else_moved_the_envs(p
 def test_solved_envs_get_no_plan_until_all_are_solved(push: OpenedTask) -> None:
     last = push.env.reset(3)
     assert envs_to_plan(Settings(selected_env=1), push.env, last) == [1]
+    assert envs_to_plan(Settings(selected_env=5), push.env, last) == [1], "a rebuild left fewer envs"
     every = Settings(solve_all=True)
     assert envs_to_plan(every, push.env, last) == [0, 1]
     last.evaluate["success"] = np.array([True, False])

@@ -15,6 +15,7 @@ from mani_skill.utils import sapien_utils
 
 from tests.cameras.edit.real_cameras import (
     FILE,
+    HEADER,
     close,
     comments,
     looking,
@@ -187,6 +188,31 @@ def test_an_edit_changes_the_number_that_an_author_would_change(
     after = dataclasses.replace(before, **change)
     plan = planned(plan_edit, {FILE: WRITTEN[name]}, KEY, before, after, run_class)
     assert isinstance(plan, SourceEdit) and text in plan.new_text
+
+
+TWO = f"""{HEADER}
+class Task(Base):
+    @property
+    def _default_sensor_configs(self):
+        return [
+            CameraConfig("cam", sapien.Pose([0.450, 0.00, 0.90]), 64, 48, 1.0, 0.01, 10),  # over the table
+            CameraConfig("other", sapien.Pose([1, 0, 1]), 64, 48, 1.0, 0.01, 10),
+        ]
+"""
+
+
+def test_a_number_that_stays_the_same_keeps_its_text() -> None:
+    before = real_settings({FILE: TWO}, "cam")
+    after = dataclasses.replace(before, position=(0.45, 0.25, 0.9))
+    plan = planned(plan_edit, {FILE: TWO}, KEY, before, after, run_class)
+    assert isinstance(plan, SourceEdit) and "[0.450, 0.25, 0.90]" in plan.new_text
+
+
+def test_a_removed_camera_takes_its_comment_with_it() -> None:
+    plan = planned(plan_remove, {FILE: TWO}, KEY, run_class)
+    assert isinstance(plan, SourceEdit)
+    lines = TWO.splitlines(keepends=True)
+    assert plan.new_text == "".join(line for line in lines if '"cam"' not in line)
 
 
 def test_a_second_edit_builds_on_the_first_and_the_placed_target_is_written() -> None:
