@@ -34,6 +34,13 @@ def test_an_object_must_be_in_one_camera_and_a_fixed_camera_must_see_an_object(
     )
 
 
+def test_each_reset_of_the_check_has_other_seeds(checked: Checked, renderer: None) -> None:
+    """The cube is in view at the first two seeds alone."""
+    far = "cube[:, 2] = CUBE_HALF_SIZE\n            cube[:, 0] += 3.0 * (self._episode_seed[env_idx.cpu()].max() > 1)"
+    result = checked("camera-sees", ("cube[:, 2] = CUBE_HALF_SIZE", far))
+    assert "6 of 8 pictures" in result.findings[0].message
+
+
 def test_a_camera_that_looks_at_the_sky(checked: Checked, renderer: None) -> None:
     up = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 1.5])"
     finding = the_finding(checked("camera-background", (EYE, up)))

@@ -45,6 +45,11 @@ def test_ground_truth_in_a_mode_with_pictures(checked: Checked, renderer: None) 
     assert finding.code.startswith('"goal_pos"') and finding.function == "_get_obs_extra"
 
 
+def test_noise_in_an_observation_follows_no_body(checked: Checked, renderer: None) -> None:
+    edit = GOAL, f'{GOAL} "noise": torch.rand((self.num_envs, 1), device=self.device),'
+    assert checked("ground-truth", edit).state == "kept"
+
+
 def test_a_hidden_goal_that_is_not_observed(checked: Checked, renderer: None) -> None:
     hide = HIDDEN_GOAL[0], "".join(HIDDEN_GOAL)
     finding = the_finding(checked("hidden-goal", hide, (GOAL, "")))

@@ -8,21 +8,25 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.drive.scenes import running
 from tests.drive.session import live_session, start_over, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import ToggleDriving
 from workbench.hands.drive_keys import KEYS, PAIRS, bindings, driven_action
 from workbench.hands.drive_panel import yaw_of
-from workbench.hands.state import Driven, Hands
+from workbench.hands.state import Driven, Hands, apply
 from workbench.live.commands import PauseRun, UseControlMode
+from workbench.live.messages import Settings
+from workbench.live.run import first_run
 from workbench.page.command import Refused
-from workbench.task.description import ActionDimension
+from workbench.task.description import ActionDimension, TaskOptions
 
 ARM = tuple(ActionDimension(f"arm/{axis}", -1.0, 2.0) for axis in ("x", "y", "z", "rx", "ry", "rz"))
 PANDA = (*ARM, ActionDimension("gripper/finger", -1.0, 1.0, zero_holds=False))
@@ -47,11 +51,21 @@ def test_values_are_within_the_bounds_and_opposite_keys_cancel(keys: set[str], y
         ("w", math.pi, -1.0, 0.0),
         ("d", math.pi, 0.0, 2.0),
         ("a", 0.0, 0.0, 2.0),
+        ("a", math.pi / 2, -1.0, 0.0),
         ("w", math.pi / 4, 2.0 * math.sqrt(0.5), 2.0 * math.sqrt(0.5)),
     ],
 )
 def test_keys_move_an_end_effector_as_the_person_sees_it(key: str, yaw: float, x: float, y: float) -> None:
     assert driven_action(PANDA, (key,), yaw)[1][:2] == pytest.approx((x, y), abs=1e-9)
+
+
+def test_the_gripper_changes_once_for_each_press_of_its_key() -> None:
+    run = replace(first_run("push.py", TaskOptions(), 1, Settings()), task=running(1).task)
+    hands, closes = Hands(driving=True), []
+    for held in (("g",), ("g", "w"), ("w",), ("g",), ("g",), ()):
+        hands, _ = apply(hands, Driven(held, 0.0), run)
+        closes.append(hands.closes)
+    assert closes == [True, True, True, False, False, False]
 
 
 def test_the_view_decides_no_other_number_than_x_and_y() -> None:

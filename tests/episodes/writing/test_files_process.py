@@ -12,13 +12,14 @@ import sys
 import termios
 from array import array
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
-from tests.drive.episodes import appended, header_of, journal_of, made
+from tests.drive.episodes import appended, geometry_of, header_of, journal_of, made
 from tests.drive.waiting import until
 from tests.episodes.read_rrd import read_rrd
 from workbench.episodes.reader.read_episode import read_episode
@@ -102,6 +103,20 @@ def test_the_process_writes_the_same_files_as_a_thread(
         InstallationSeal.CONTENT
     }
     assert files_in(tmp_path / "process") == [".h5", ".json", ".rrd"]
+
+
+def test_each_episode_has_the_meshes_of_its_own_scene(tmp_path: Path, process: FilesProcess) -> None:
+    for scale in (1, 2):
+        episode = made(3)
+        visuals = tuple(
+            replace(one, mesh=replace(one.mesh, vertices=one.mesh.vertices * scale))
+            for one in geometry_of(episode).visuals
+        )
+        episode = replace(episode, geometry=replace(geometry_of(episode), visuals=visuals))
+        files = appended(tmp_path / f"{scale}", episode, pictures=False).finish(process)
+        read = geometry_of(read_episode(files.json)).visuals
+        for one, other in zip(read, visuals, strict=True):
+            np.testing.assert_allclose(one.mesh.vertices, other.mesh.vertices)
 
 
 def test_a_write_error_is_reported_as_on_a_thread(tmp_path: Path, process: FilesProcess) -> None:

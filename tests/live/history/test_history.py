@@ -172,6 +172,19 @@ def test_rewards_of_an_episode_follow_where_it_went_back_to(fake: FakeWorkerSess
     assert rewards(fake) == [[1, 2, 3], [1, 2, 3, 4, 5], [1, 2, 3, 4, 5]]
 
 
+def test_each_env_that_went_back_has_the_past_of_its_own_source(fake: FakeWorkerSession) -> None:
+    fake.play(0)
+    for number in (10.0, 20.0, 30.0):
+        fake.step(reward=[number, number + 1, number + 2])
+    fake.back((2, 0), (1, 2), 2)
+    fake.step(reward=[1.0, 2.0, 3.0])
+    assert rewards(fake) == [[12, 22, 1], [11, 21, 31, 2], [11, 21, 3]]
+    paths = fake.session.look(
+        lambda run: [run.past.history.episode(env, run.past.history.last) for env in range(3)]
+    )
+    assert [[at for _, at in path] for path in paths] == [[2, 2, 2, 0], [1] * 5, [1, 1, 1, 2]]
+
+
 def test_events_are_first_successes_truncations_and_jumps(fake: FakeWorkerSession) -> None:
     fake.play(0)
     fake.step(success=(1,))

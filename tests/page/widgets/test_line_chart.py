@@ -29,6 +29,11 @@ def test_a_line_is_drawn_at_its_numbers_with_gaps_and_the_legend_has_the_value_a
     assert len(chart.lines) == 3, "the gap splits the second line into two"
 
 
+def test_larger_numbers_are_higher_and_later_steps_further_right() -> None:
+    html = chart_html("reward", X, [ChartLine("one", X)])
+    assert 'points="0,100 50,50 100,0"' in html, "y runs down in SVG"
+
+
 def test_a_press_sends_the_step_under_it() -> None:
     html = chart_html(
         "reward", np.arange(5, 55), [ChartLine("one", np.arange(50.0))], press=lambda k: Seek(step=k)
