@@ -167,7 +167,7 @@ class _Comparison:
         return found
 
     def _is_hook(self, key: Key, family: set[Key]) -> bool:
-        return key in self._versions.members(family, _RUNS_LATER | CAMERA_HOOKS)
+        return key in self._versions.members(family, _RUNS_LATER)
 
     # --- code that the live env was built by ---------------------------------------------------------
 
