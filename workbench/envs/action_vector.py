@@ -11,11 +11,14 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from mani_skill.agents.controllers.base_controller import CombinedController
-from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController, PDEEPoseController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
+from mani_skill.agents.controllers.pd_joint_pos_vel import PDJointPosVelController
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.geometry.rotation_conversions import matrix_to_euler_angles, quaternion_to_matrix
 from numpy.typing import NDArray
 
+from workbench.envs import maniskill_private
 from workbench.envs.broken_rule import place_of_class
 from workbench.envs.error_notes import RefusedCall, WrongAction
 from workbench.envs.evaluate_entries import describe, type_text
@@ -110,8 +113,7 @@ def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.floa
 
     * Delta and velocity controllers: zero.
     * Absolute joint position: the present qpos, through the inverse of ManiSkill's ``clip_and_scale_action``.
-    * Absolute end-effector pose: zero, which does not hold, since a pose that holds would need the
-      controller's frame. Hold such a robot with ``step(None)``.
+    * Absolute end-effector pose: the present pose.
     """
     columns = [_hold(part, num_envs) for part in parts]
     return np.concatenate(columns, axis=1) if columns else np.zeros((num_envs, 0), np.float32)
@@ -254,7 +256,7 @@ def _dimension_names(controller: Any) -> list[str]:
 
 
 def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:
-    """(A,) True for absolute joint positions: each stays the target of its joint until the next action."""
+    """(A,) True for absolute joint positions and end-effector poses: each stays the target until the next action."""
     columns = [np.full(len(part.names), _is_absolute(part.controller)) for part in parts]
     return np.concatenate(columns) if columns else np.zeros(0, bool)
 
@@ -267,22 +269,41 @@ def zero_holds(part: ActionPart) -> bool:
 
 def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
     controller: Any = part.controller
-    count = len(part.names)
     if not _is_absolute(controller):
-        return np.zeros((num_envs, count), np.float32)
-    qpos = controller.qpos
-    controlled = getattr(controller, "control_joint_indices", None)
-    if controlled is not None:
-        qpos = qpos[:, controlled.long()]
-    if controller.config.normalize_action:
-        low, high = controller.action_space_low, controller.action_space_high
-        qpos = (2 * qpos - (high + low)) / (high - low)
-    return np.clip(qpos.cpu().numpy(), part.low, part.high).astype(np.float32)
+        return np.zeros((num_envs, len(part.names)), np.float32)
+    if isinstance(controller, PDEEPosController):
+        pose = controller.ee_pose_at_base
+        wanted = pose.p
+        if isinstance(controller, PDEEPoseController):
+            wanted = torch.hstack([pose.p, matrix_to_euler_angles(quaternion_to_matrix(pose.q), "XYZ")])
+        held = unscaled(part, wanted.cpu().numpy())
+    else:
+        qpos = controller.qpos
+        controlled = getattr(controller, "control_joint_indices", None)
+        if controlled is not None:
+            qpos = qpos[:, controlled.long()]
+        if isinstance(controller, PDJointPosVelController):
+            qpos = torch.cat([qpos, torch.zeros_like(qpos)], dim=1)
+        if controller.config.normalize_action:
+            low, high = controller.action_space_low, controller.action_space_high
+            qpos = (2 * qpos - (high + low)) / (high - low)
+        held = qpos.cpu().numpy()
+    return np.clip(held, part.low, part.high).astype(np.float32)
+
+
+def unscaled(part: ActionPart, wanted: NDArray[Any]) -> NDArray[Any]:
+    """(N, D) numbers of the action that the part's controller scales to `wanted` (N, D), without bounds: the inverse of its
+    affine map."""
+    at_zero, at_half = (
+        maniskill_private.scaled_action(
+            part.controller, torch.full(wanted.shape, number, device=part.controller.device)
+        )
+        .cpu()
+        .numpy()
+        for number in (0.0, 0.5)
+    )
+    return (wanted - at_zero) / (2 * (at_half - at_zero))
 
 
 def _is_absolute(controller: Any) -> bool:
-    return _is_joint_position(controller) and not controller.config.use_delta
-
-
-def _is_joint_position(controller: object) -> bool:
-    return isinstance(controller, PDJointPosController) and not isinstance(controller, PDEEPosController)
+    return isinstance(controller, PDJointPosController) and not controller.config.use_delta

@@ -45,6 +45,7 @@ NAMED_STATE = "names of the parts of a flat state observation"
 ELSEWHERE = "pictures of a pose that is set and not applied yet"
 PLACING = "placing cameras"
 POSE_CONTROL = "control modes that set the hand's pose, pd_ee_..."
+REACHING = "handles that move an arm"
 WRITING = "writing cameras into the file"
 
 _ENV = "mani_skill.envs.sapien_env:BaseEnv"
@@ -87,6 +88,8 @@ PRIVATE_NAMES = (
         _POSE_CONTROLLER, POSE_CONTROL, "_preprocess_action _start_qpos _target_pose _target_qpos _sim_steps"
     ),
     *_all(_POSE_CONTROLLER, POSE_CONTROL, "_step _step_size _check_gpu_sim_works kinematics"),
+    *_all("mani_skill.agents.base_agent:BaseAgent", REACHING, "_controller_configs"),
+    *_all("mani_skill.agents.controllers.base_controller:BaseController", REACHING, "_preprocess_action"),
     *_all("sapien.render:RenderBodyComponent", ELSEWHERE, "_internal_node"),
     *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
     *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
@@ -562,6 +565,31 @@ def tool_of(agent: Any) -> Link | None:
     except Exception:  # a property of the author's, which ManiSkill itself never reads
         return None
     return tool if isinstance(tool, Link) else None
+
+
+_TOOLS = ("tcp", "right_tcp", "left_tcp", "tcp_2")
+"""Attributes in which ManiSkill's robots keep the links of their tool centre points."""
+
+
+def tools_of(agent: Any) -> list[Link]:
+    """The links of a robot's tool centre points; if there are none, the tip of its fixed finger, ``finger1_tip``."""
+    kept = vars(agent)
+    found = [kept[name] for name in _TOOLS if isinstance(kept.get(name), Link)]
+    tip = kept.get("finger1_tip")
+    return found or ([tip] if isinstance(tip, Link) else [])
+
+
+def controller_configs(agent: Any) -> list[Any]:
+    """The controller configs of all control modes of a robot, without the dicts that combine them."""
+    if why_not(REACHING):
+        return []
+    modes = agent._controller_configs.values()
+    return [part for mode in modes for part in (mode.values() if isinstance(mode, dict) else (mode,))]
+
+
+def scaled_action(controller: Any, action: torch.Tensor) -> torch.Tensor:
+    """(N, D) what a controller makes of the numbers (N, D) of its action within the bounds: ``_preprocess_action``."""
+    return controller._preprocess_action(action)
 
 
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:

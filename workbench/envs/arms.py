@@ -1,0 +1,376 @@
+"""Arms of the robots: their end effectors, inverse kinematics, and the action that moves an arm to a pose.
+
+The inverse kinematics are those of SAPIEN (``create_pinocchio_model``), which ManiSkill's end-effector controllers use on the
+CPU. They need no URDF and work for one env at a time on any device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.agents.controllers.pd_ee_pose import (
+    PDEEPosController,
+    PDEEPosControllerConfig,
+    PDEEPoseController,
+)
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosMimicController
+from mani_skill.agents.controllers.pd_joint_pos_vel import PDJointPosVelController
+from mani_skill.agents.controllers.pd_joint_vel import PDJointVelController
+from mani_skill.utils.geometry.rotation_conversions import matrix_to_euler_angles
+from numpy.typing import NDArray
+
+from workbench.envs import maniskill_private
+from workbench.envs.action_vector import ActionPart, action_parts, unscaled
+from workbench.envs.scene.scene_index import once_a_scene, scene_index
+
+Floats = NDArray[np.floating[Any]]
+NEAR_METRES, NEAR_DEGREES = 0.005, 2.0
+"""Largest errors of a pose that counts as reached."""
+MIN_JOINTS = 3
+"""Minimum number of joints of an arm."""
+_ITERATIONS, _STEP = 40, 0.25
+"""Iterations of one run of the solver, and share of the error that each removes. The solver ignores the limits: the result is put within them, and the next run continues."""
+_RUNS, _RUNS_FOR_POSITION = 3, 6
+"""Maximum number of runs for the whole pose, then for its position."""
+_HALVINGS = 7
+"""Bisections of the way to a target that is out of reach."""
+_AT_LIMIT = 1e-3
+"""Distance from a limit in rad or m at which a joint counts as being there."""
+_VELOCITY_GAIN = 0.25
+"""Share of the remaining way that a velocity controller takes in one control step."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An end effector of a robot, and the joints that move it."""
+
+    name: str
+    """Name of the end effector's body, as in `SceneIndex.names`."""
+    articulation: Any
+    """ManiSkill's Articulation."""
+    link: Any
+    """ManiSkill's Link of the end effector."""
+    joints: tuple[int, ...]
+    """Positions of the joints among the active joints of the articulation."""
+    models: dict[int, Any] = field(default_factory=dict)
+    """SAPIEN's PinocchioModel by env; filled when an env is asked for the first time."""
+
+    def row(self, env: int) -> int | None:
+        """The env's row in the values of `articulation` and `link`; None if the env lacks the robot."""
+        at = np.flatnonzero(maniskill_private.envs_of(self.articulation) == env)
+        return int(at[0]) if len(at) else None
+
+    def qpos(self, env: int) -> NDArray[np.float64]:
+        """(J,) positions of all active joints of the articulation in this env."""
+        return _numbers(self.articulation.get_qpos()[self.row(env)])
+
+    def limits(self, env: int) -> NDArray[np.float64]:
+        """(J, 2) limits of the active joints in this env."""
+        return _numbers(self.articulation.get_qlimits()[self.row(env)])
+
+
+@dataclass(frozen=True)
+class ArmPose:
+    """The joint positions that bring an end effector nearest to a target."""
+
+    qpos: NDArray[np.float64]
+    """(J,) of all active joints of the articulation; only the arm's own differ from those at the start."""
+    poses: NDArray[np.float32]
+    """(L, 7) resulting poses of the articulation's links, in the env's frame."""
+    metres: float
+    degrees: float
+    """Position and rotation errors that remain at the end effector."""
+    why: str
+    """Why the target is out of reach; empty if it is within."""
+
+
+@once_a_scene
+def find_arms(env: Any) -> tuple[Arm, ...]:
+    """The arms of all robots of a ManiSkill env (unwrapped, reset at least once)."""
+    return tuple(arm for agent in maniskill_private.agents(env) for arm in _arms_of(env, agent))
+
+
+def without_arms(env: Any) -> tuple[str, ...]:
+    """Names of the robots that have no arm."""
+    armed = {id(arm.articulation) for arm in find_arms(env)}
+    return tuple(str(a.uid) for a in maniskill_private.agents(env) if id(a.robot) not in armed)
+
+
+def _arms_of(env: Any, agent: Any) -> Iterator[Arm]:
+    found = list(_ends_with_joints(agent))
+    shared = [joint for _, joints in found for joint in set(joints)]
+    for link, joints in found:
+        own = tuple(joint for joint in joints if shared.count(joint) == 1) if len(found) > 1 else joints
+        name = scene_index(env).name_of(maniskill_private.objects_of(link)[0])
+        if len(own) >= MIN_JOINTS and name is not None:
+            yield Arm(name, agent.robot, link, own)
+
+
+def _ends_with_joints(agent: Any) -> Iterator[tuple[Any, tuple[int, ...]]]:
+    """End effectors with their joints: those of end-effector controllers; else the robot's tools, with all joints that move
+    them; else the end of the chain up to the first branch, which is a hand."""
+    robot = agent.robot
+    index = {joint.name: k for k, joint in enumerate(robot.active_joints)}
+    controlled = {
+        part.ee_link: tuple(index[name] for name in part.joint_names)
+        for part in maniskill_private.controller_configs(agent)
+        if isinstance(part, PDEEPosControllerConfig) and part.ee_link is not None
+    }
+    if controlled:
+        yield from ((robot.links_map[link], joints) for link, joints in controlled.items())
+    elif tools := maniskill_private.tools_of(agent):
+        yield from ((tool, _ancestors(tool)) for tool in tools)
+    else:
+        link = robot.root
+        chain: list[int] = []
+        while len(below := _moved_by_next_joints(robot, link)) == 1:
+            link = below[0]
+            chain.append(_active(link))
+        if chain:
+            yield link, tuple(chain)
+
+
+def _active(link: Any) -> int:
+    return int(link.joint.active_index[0])
+
+
+def _ancestors(link: Any) -> tuple[int, ...]:
+    """Active joints from the root to the link."""
+    found: list[int] = []
+    while link is not None:
+        if link.joint.active_index is not None:
+            found.append(_active(link))
+        link = link.joint.parent_link
+    return tuple(reversed(found))
+
+
+def _moved_by_next_joints(robot: Any, link: Any) -> list[Any]:
+    """Links at the next active joints below a link."""
+    found = []
+    for one in robot.links:
+        if one.joint.active_index is None:
+            continue
+        parent = one.joint.parent_link
+        while parent is not None and parent.name != link.name and parent.joint.active_index is None:
+            parent = parent.joint.parent_link
+        if parent is not None and parent.name == link.name:
+            found.append(one)
+    return found
+
+
+# --- inverse kinematics ----------------------------------------------------------------------------------
+
+
+def solve(arm: Arm, env: int, target: Floats) -> ArmPose:
+    """The joint positions within the limits that bring the end effector to a target, starting from the present ones.
+
+    If no joint positions give the whole pose, the position comes before the rotation. If none give the position either, the
+    end effector goes as far along the straight line to the target as it can.
+
+    Args:
+        target: (7,) position and quaternion wxyz in the frame of the env, which has the robot.
+    """
+    row = arm.row(env)
+    assert row is not None, "the env has the robot"
+    body = maniskill_private.objects_of(arm.articulation)[row]
+    if env not in arm.models:
+        arm.models[env] = body.create_pinocchio_model()
+    root = _pose(arm.articulation.pose.raw_pose[row])
+    wanted = root.inv() * sapien.Pose(target[:3], target[3:] / np.linalg.norm(target[3:]))
+    qpos, limits = arm.qpos(env), arm.limits(env)
+    chain = _Chain(arm.models[env], maniskill_private.objects_of(arm.link)[row].index, arm.joints, limits)
+    found = chain.follow(qpos, wanted)
+    if found is None:  # a stretched arm does not bend by itself
+        found = chain.follow(chain.middle(qpos), wanted)
+    if found is None:
+        start = chain.pose(qpos).p
+        reached, beyond = 0.0, 1.0
+        found = qpos
+        for _ in range(_HALVINGS):
+            middle = (reached + beyond) / 2
+            between = chain.follow(found, sapien.Pose(start + middle * (wanted.p - start), wanted.q))
+            if between is None:
+                beyond = middle
+            else:
+                reached, found = middle, between
+    metres, degrees = left = _apart(chain.pose(found), wanted)
+    poses = [root * chain.model.get_link_pose(k) for k in range(len(body.links))]
+    why = "" if _is_near(left) else _why_not(arm, found, limits, left)
+    return ArmPose(found, np.array([[*p.p, *p.q] for p in poses], np.float32), metres, degrees, why)
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """The chain of an arm in one env; poses are in the frame of the articulation's root."""
+
+    model: Any
+    """SAPIEN's PinocchioModel."""
+    link: int
+    joints: tuple[int, ...]
+    limits: Floats
+    """(J, 2)"""
+
+    def pose(self, qpos: Floats) -> sapien.Pose:
+        """Pose of the end effector."""
+        self.model.compute_forward_kinematics(qpos)
+        return self.model.get_link_pose(self.link)
+
+    def middle(self, qpos: Floats) -> Floats:
+        """`qpos` with the joints in the middle of their limits, as far as they have any."""
+        bent, middle = np.array(qpos, np.float64), self.limits.mean(axis=1)
+        for joint in self.joints:
+            if np.isfinite(middle[joint]):
+                bent[joint] = middle[joint]
+        return bent
+
+    def follow(self, qpos: Floats, wanted: sapien.Pose) -> NDArray[np.float64] | None:
+        """Joint positions (J,) within the limits that give the pose, or at least its position; None if there are none near
+        `qpos`."""
+        mask = np.zeros(len(qpos), bool)
+        mask[list(self.joints)] = True
+        low, high = (np.where(mask, bound, qpos) for bound in self.limits.T)
+        goal, q = wanted, np.asarray(qpos, np.float64)
+        for run in range(_RUNS + _RUNS_FOR_POSITION):
+            result, _, _ = self.model.compute_inverse_kinematics(
+                self.link, goal, initial_qpos=q, active_qmask=mask, max_iterations=_ITERATIONS, dt=_STEP
+            )
+            q = np.clip(np.asarray(result, np.float64), low, high)
+            now = self.pose(q)
+            left = _apart(now, wanted)
+            if _is_near(left) or (run >= _RUNS and left[0] < NEAR_METRES / 2):
+                return q
+            if run >= _RUNS - 1:
+                # The solver weighs metres like radians: only a rotation that it has reached leaves the position to it.
+                goal = sapien.Pose(wanted.p, now.q)
+        return None
+
+
+def _is_near(error: tuple[float, float]) -> bool:
+    return error[0] < NEAR_METRES and error[1] < NEAR_DEGREES
+
+
+def _why_not(arm: Arm, qpos: Floats, limits: Floats, left: tuple[float, float]) -> str:
+    names = [arm.articulation.active_joints[k].name for k in arm.joints if _at_limit(qpos[k], limits[k])]
+    if names:
+        return f"no solution within the limits of {', '.join(names)}"
+    if left[0] < NEAR_METRES:
+        return f"{len(arm.joints)} joints cannot turn the tool so at this place"
+    return "no solution was found; it may be too far away"
+
+
+def _at_limit(value: float, limits: Floats) -> bool:
+    return bool(value < limits[0] + _AT_LIMIT or value > limits[1] - _AT_LIMIT)
+
+
+def _apart(one: sapien.Pose, other: sapien.Pose) -> tuple[float, float]:
+    """Distance in metres, and angle in degrees."""
+    cosine = min(1.0, abs(float(np.dot(one.q, other.q))))
+    return float(np.linalg.norm(one.p - other.p)), float(np.rad2deg(2 * np.arccos(cosine)))
+
+
+# --- the action that leads there -------------------------------------------------------------------------
+
+
+def steer(env: Any, arm: Arm, of: int, goal: ArmPose, action: NDArray[np.float32]) -> bool:
+    """Set the numbers of the arm in the flat action (A,) of env `of`, so that the next control step goes towards the goal.
+
+    Returns:
+        Whether the control mode can move the arm.
+    """
+    first, moves = 0, False
+    for part in action_parts(env):
+        columns = slice(first, first + len(part.names))
+        first = columns.stop
+        if part.controller.articulation is arm.articulation:
+            values = _values(env, part, arm, of, goal)
+            if values is not None:
+                action[columns], moves = np.clip(values, part.low, part.high), True
+    return moves
+
+
+def _values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -> Floats | None:
+    """The part's numbers of the action; None if it does not move the arm."""
+    controller: Any = part.controller
+    row = arm.row(of)
+    if isinstance(controller, PDEEPosController):
+        if controller.ee_link.name != arm.link.name:
+            return None
+        return _pose_values(env, part, arm, of, goal)
+    own = controller.active_joint_indices.tolist()
+    if not set(own) & set(arm.joints) or isinstance(controller, PDJointPosMimicController):
+        return None
+    now = arm.qpos(of)
+    moved = np.isin(own, arm.joints)
+    wanted = np.where(moved, goal.qpos[own], now[own])
+    if isinstance(controller, PDJointVelController):
+        return _in_bounds(_action_for(env, part, _VELOCITY_GAIN * (wanted - now[own]) / _step_seconds(env)))
+    if not isinstance(controller, PDJointPosController):
+        return None
+    relative = controller.config.use_delta
+    if relative:
+        state = controller.get_state()
+        wanted = wanted - (_numbers(state["target_qpos"][row]) if state else now[own])
+        wanted = np.where(moved, wanted, 0.0)
+    if isinstance(controller, PDJointPosVelController):
+        wanted = np.concatenate([wanted, np.zeros(len(own))])
+    values = _action_for(env, part, wanted)
+    return _in_bounds(values) if relative else values
+
+
+def _pose_values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -> Floats:
+    """Numbers of an end-effector controller."""
+    controller: Any = part.controller
+    row, turns = arm.row(of), isinstance(controller, PDEEPoseController)
+    base = _pose(controller.root_link.pose.raw_pose[row])
+    link = maniskill_private.objects_of(arm.link)[row].index
+    wanted = base.inv() * sapien.Pose(goal.poses[link, :3], goal.poses[link, 3:])
+    if not controller.config.use_delta:
+        rotation = _euler(wanted) if turns else []
+        return _action_for(env, part, np.array([*wanted.p, *rotation]))
+    state = controller.get_state()
+    before = _pose(state["target_pose"][row]) if state else base.inv() * _pose(arm.link.pose.raw_pose[row])
+    frame = str(controller.config.frame)
+    move = wanted.p - before.p
+    if "body_translation" in frame:
+        move = sapien.Pose(q=before.q).inv().to_transformation_matrix()[:3, :3] @ move
+    if not turns:
+        return _in_bounds(_action_for(env, part, move))
+    now, then = sapien.Pose(q=before.q), sapien.Pose(q=wanted.q)
+    turn = now.inv() * then if "body_aligned" in frame else then * now.inv()
+    values = _action_for(env, part, np.array([*move, *_euler(turn)]))
+    values[:3] = _in_bounds(values[:3])
+    values[3:] /= max(1.0, float(np.linalg.norm(values[3:])))
+    return values
+
+
+def _action_for(env: Any, part: ActionPart, wanted: Floats) -> Floats:
+    """The part's numbers (D,) that its controller scales to `wanted` (D,), without bounds."""
+    return unscaled(part, np.broadcast_to(wanted, (env.num_envs, len(wanted))))[0].astype(np.float64)
+
+
+def _in_bounds(values: Floats) -> Floats:
+    """A relative action, shortened to -1 to 1 without a change of its direction."""
+    return values / max(1.0, float(np.abs(values).max(initial=0.0)))
+
+
+def _step_seconds(env: Any) -> float:
+    return 1.0 / env.control_freq
+
+
+def _euler(pose: sapien.Pose) -> list[float]:
+    matrix = torch.as_tensor(pose.to_transformation_matrix()[:3, :3])
+    return matrix_to_euler_angles(matrix, "XYZ").tolist()
+
+
+def _numbers(tensor: torch.Tensor) -> NDArray[np.float64]:
+    return np.asarray(tensor.numpy(force=True), np.float64)
+
+
+def _pose(raw: torch.Tensor) -> sapien.Pose:
+    values = raw.numpy(force=True)
+    return sapien.Pose(values[:3], values[3:7])
