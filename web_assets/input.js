@@ -17,8 +17,10 @@
 //   data-field='["set_seed", {}, "seed"]'    command, its other fields, and the field for the value: committed on Enter or blur, when an
 //                                            option is chosen, or (data-live) on every input; Enter sends data-enter
 //     data-number="[0, null, 1, true]"         a number: minimum, maximum, step of an arrow key, whether it is an integer
-//   data-drive='["drive_robot", "keys", ["w"]]'  while this element is in the page, these keys drive: the command's field has
-//                                            the held ones, sent when they change and every 100 ms
+//   data-drive='["drive_robot", "keys", ["w"], "axes", "buttons"]'  while this element is in the page, these keys drive: the
+//                                            command's field has the held ones, sent when they change and every 100 ms; the last
+//                                            two fields have the deflections of a gamepad, sent every 50 ms while one is held.
+//                                            <html> has data-gamepad while the browser reports a gamepad of the standard layout
 //   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrow keys from it
 //                                            into the list, starting at data-best
 //   data-shows='[["text.set_seed.seed", "12", false, {}]]'  name of a data-field element; the server's value, copied into the element
@@ -305,8 +307,8 @@
     const drive = document.querySelector("[data-drive]")?.dataset.drive;
     if (!drive) held.clear();
     else {
-      const [name, field] = JSON.parse(drive);
-      sendNewest("drive", [name, { [field]: [...held] }]);
+      const [name, field, , axes, buttons] = JSON.parse(drive);
+      sendNewest("drive", [name, { [field]: [...held], [axes]: pad?.axes ?? [], [buttons]: pad?.buttons ?? [] }]);
     }
     if (held.size) beat ||= setInterval(reportHeld, BEAT);
     else beat = clearInterval(beat);
@@ -321,6 +323,26 @@
       reportHeld();
     }
     return true;
+  }
+
+  const PAD_BEAT = 50; // milliseconds between readings of the gamepad
+  const REST = 0.1; // deflection up to which a stick or button counts as released
+  let pad = null; // deflections while one is held
+  let padBeat = 0;
+
+  function readPad() {
+    const driving = document.querySelector("[data-drive]");
+    const found = driving && [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected && one.mapping === "standard");
+    document.documentElement.toggleAttribute("data-gamepad", Boolean(found));
+    const was = pad;
+    const rounded = (value) => Math.round(1000 * Math.max(-1, Math.min(1, value))) / 1000;
+    const axes = (found?.axes ?? []).slice(0, 4).map(rounded);
+    const buttons = (found?.buttons ?? []).slice(0, 17).map((button) => rounded(button.value));
+    // Another window may be in front: what is held there is not meant for the robot.
+    const isHeld = document.hasFocus() && [...axes, ...buttons].some((value) => Math.abs(value) > REST);
+    pad = isHeld ? { axes, buttons } : null;
+    if (pad || was) reportHeld();
+    if (!driving) padBeat = clearInterval(padBeat);
   }
 
   addEventListener("keyup", (event) => held.delete(drivingKey(event)) && reportHeld(), true);
@@ -584,6 +606,9 @@
     tell(element) {
       const { tell, only } = element.dataset;
       if (!only || document.documentElement.hasAttribute(`data-${only}`)) send(JSON.parse(tell));
+    },
+    drive() {
+      padBeat ||= setInterval(readPad, PAD_BEAT);
     },
     autofocus(input) {
       input.focus();

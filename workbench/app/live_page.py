@@ -30,6 +30,7 @@ from workbench.checks.profile_panel import StepProfilePanel
 from workbench.hands.drive_panel import DrivePanel, DrivingSign
 from workbench.hands.look import BodyView
 from workbench.hands.panel import HandsPanel
+from workbench.hands.reach_panel import ReachPanel
 from workbench.live.commands import ChoosePictures, SetSeed
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
@@ -238,6 +239,7 @@ class Page:
             self._run = RunPanel(server, session)
             with self._run.actions:
                 drive = DrivePanel(server, session, self._run.below_mode)
+                self._reach = ReachPanel(server, session, self._run.below_mode + 0.1)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
             self._view_panel = ViewPanel(server, dark, self._view_choice)
@@ -274,7 +276,7 @@ class Page:
             profile = StepProfilePanel(server, self._link)
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
-        of_run = self._run, drive, version, options, self._view_panel
+        of_run = self._run, drive, self._reach, version, options, self._view_panel
         return [*of_run, self._inspect, self._hands, self._body_view, self._solve, seeds, profile, checks]
 
     def _add_left_dock(self) -> None:
@@ -308,10 +310,12 @@ class Page:
             self._visitors_counted = visitors
             self._session.happen(PagesCounted(visitors))
             self._hands.follow(self._session.view())
+            self._reach.follow()
 
     def close(self) -> None:
         """Release the page. The session may continue under another page, and must not render for this one."""
         self._hands.let_go()
+        self._reach.let_go()
         self.counted(0)
         self._choices.end()
 
@@ -322,6 +326,7 @@ class Page:
         draw_apart(self._server, panels, lambda: self._draw_scene(view))
         self._watch(view)
         self._hands.follow(view)
+        self._reach.follow()
 
     def _watch(self, view: SessionView) -> None:
         """Request from the session the pictures that the page shows."""
@@ -464,7 +469,7 @@ class Page:
         if collisions := self._view_choice.collisions and len(geometry.collisions) > 0:
             geometry = geometry.as_collisions
         looks = self._in_software.looks(self._view_panel.looks, geometry, self._layout, one)
-        poses = self._hands.moved(geometry, step.poses)
+        poses = self._reach.moved(view, self._hands.moved(geometry, step.poses))
         built = (one, looks, collisions)
         if built != self._built:
             self._built = built
@@ -487,6 +492,7 @@ class Page:
         self._hands.draw_in_view(view, poses, offset)
         read = self._inspect.body_reading(view) if self._view_choice.frames else None
         self._body_view.draw_in_view(view, poses, offset, read)
+        self._reach.draw_in_view(view, poses, offset)
         if self._view_choice.frames:
             self._frames.draw(*selected)
         else:

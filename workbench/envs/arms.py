@@ -29,6 +29,8 @@ from workbench.envs.action_vector import ActionPart, action_parts, unscaled
 from workbench.envs.scene.scene_index import once_a_scene, scene_index
 
 Floats = NDArray[np.floating[Any]]
+Pose = Any
+"""A ``sapien.Pose``, whose type refuses arrays of an unknown length."""
 NEAR_METRES, NEAR_DEGREES = 0.005, 2.0
 """Largest errors of a pose that counts as reached."""
 MIN_JOINTS = 3
@@ -39,6 +41,7 @@ _RUNS, _RUNS_FOR_POSITION = 3, 6
 """Maximum number of runs for the whole pose, then for its position."""
 _HALVINGS = 7
 """Bisections of the way to a target that is out of reach."""
+_ORIGIN = np.zeros(3)
 _AT_LIMIT = 1e-3
 """Distance from a limit in rad or m at which a joint counts as being there."""
 _VELOCITY_GAIN = 0.25
@@ -59,6 +62,10 @@ class Arm:
     """Positions of the joints among the active joints of the articulation."""
     models: dict[int, Any] = field(default_factory=dict)
     """SAPIEN's PinocchioModel by env; filled when an env is asked for the first time."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(self.articulation.active_joints[k].name for k in self.joints)
 
     def row(self, env: int) -> int | None:
         """The env's row in the values of `articulation` and `link`; None if the env lacks the robot."""
@@ -181,7 +188,7 @@ def solve(arm: Arm, env: int, target: Floats) -> ArmPose:
     if env not in arm.models:
         arm.models[env] = body.create_pinocchio_model()
     root = _pose(arm.articulation.pose.raw_pose[row])
-    wanted = root.inv() * sapien.Pose(target[:3], target[3:] / np.linalg.norm(target[3:]))
+    wanted = root.inv() * _pose_of(target[:3], target[3:] / np.linalg.norm(target[3:]))
     qpos, limits = arm.qpos(env), arm.limits(env)
     chain = _Chain(arm.models[env], maniskill_private.objects_of(arm.link)[row].index, arm.joints, limits)
     found = chain.follow(qpos, wanted)
@@ -193,7 +200,7 @@ def solve(arm: Arm, env: int, target: Floats) -> ArmPose:
         found = qpos
         for _ in range(_HALVINGS):
             middle = (reached + beyond) / 2
-            between = chain.follow(found, sapien.Pose(start + middle * (wanted.p - start), wanted.q))
+            between = chain.follow(found, _pose_of(start + middle * (wanted.p - start), wanted.q))
             if between is None:
                 beyond = middle
             else:
@@ -215,7 +222,7 @@ class _Chain:
     limits: Floats
     """(J, 2)"""
 
-    def pose(self, qpos: Floats) -> sapien.Pose:
+    def pose(self, qpos: Floats) -> Pose:
         """Pose of the end effector."""
         self.model.compute_forward_kinematics(qpos)
         return self.model.get_link_pose(self.link)
@@ -228,7 +235,7 @@ class _Chain:
                 bent[joint] = middle[joint]
         return bent
 
-    def follow(self, qpos: Floats, wanted: sapien.Pose) -> NDArray[np.float64] | None:
+    def follow(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64] | None:
         """Joint positions (J,) within the limits that give the pose, or at least its position; None if there are none near
         `qpos`."""
         mask = np.zeros(len(qpos), bool)
@@ -246,7 +253,7 @@ class _Chain:
                 return q
             if run >= _RUNS - 1:
                 # The solver weighs metres like radians: only a rotation that it has reached leaves the position to it.
-                goal = sapien.Pose(wanted.p, now.q)
+                goal = _pose_of(wanted.p, now.q)
         return None
 
 
@@ -267,7 +274,7 @@ def _at_limit(value: float, limits: Floats) -> bool:
     return bool(value < limits[0] + _AT_LIMIT or value > limits[1] - _AT_LIMIT)
 
 
-def _apart(one: sapien.Pose, other: sapien.Pose) -> tuple[float, float]:
+def _apart(one: Pose, other: Pose) -> tuple[float, float]:
     """Distance in metres, and angle in degrees."""
     cosine = min(1.0, abs(float(np.dot(one.q, other.q))))
     return float(np.linalg.norm(one.p - other.p)), float(np.rad2deg(2 * np.arccos(cosine)))
@@ -328,7 +335,7 @@ def _pose_values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -
     row, turns = arm.row(of), isinstance(controller, PDEEPoseController)
     base = _pose(controller.root_link.pose.raw_pose[row])
     link = maniskill_private.objects_of(arm.link)[row].index
-    wanted = base.inv() * sapien.Pose(goal.poses[link, :3], goal.poses[link, 3:])
+    wanted = base.inv() * _pose_of(goal.poses[link, :3], goal.poses[link, 3:])
     if not controller.config.use_delta:
         rotation = _euler(wanted) if turns else []
         return _action_for(env, part, np.array([*wanted.p, *rotation]))
@@ -337,10 +344,10 @@ def _pose_values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -
     frame = str(controller.config.frame)
     move = wanted.p - before.p
     if "body_translation" in frame:
-        move = sapien.Pose(q=before.q).inv().to_transformation_matrix()[:3, :3] @ move
+        move = _pose_of(_ORIGIN, before.q).inv().to_transformation_matrix()[:3, :3] @ move
     if not turns:
         return _in_bounds(_action_for(env, part, move))
-    now, then = sapien.Pose(q=before.q), sapien.Pose(q=wanted.q)
+    now, then = _pose_of(_ORIGIN, before.q), _pose_of(_ORIGIN, wanted.q)
     turn = now.inv() * then if "body_aligned" in frame else then * now.inv()
     values = _action_for(env, part, np.array([*move, *_euler(turn)]))
     values[:3] = _in_bounds(values[:3])
@@ -362,7 +369,7 @@ def _step_seconds(env: Any) -> float:
     return 1.0 / env.control_freq
 
 
-def _euler(pose: sapien.Pose) -> list[float]:
+def _euler(pose: Pose) -> list[float]:
     matrix = torch.as_tensor(pose.to_transformation_matrix()[:3, :3])
     return matrix_to_euler_angles(matrix, "XYZ").tolist()
 
@@ -371,6 +378,10 @@ def _numbers(tensor: torch.Tensor) -> NDArray[np.float64]:
     return np.asarray(tensor.numpy(force=True), np.float64)
 
 
-def _pose(raw: torch.Tensor) -> sapien.Pose:
+def _pose(raw: torch.Tensor) -> Pose:
     values = raw.numpy(force=True)
-    return sapien.Pose(values[:3], values[3:7])
+    return _pose_of(values[:3], values[3:7])
+
+
+def _pose_of(p: Any, q: Any) -> Pose:
+    return sapien.Pose(p, q)

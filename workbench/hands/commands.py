@@ -10,6 +10,7 @@ from workbench.page.command import Command
 
 Axis = Literal["x", "y", "z"]
 Angle = Literal["roll", "pitch", "yaw"]
+Deflection = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 
@@ -54,9 +55,18 @@ class ToggleDriving(Command, frozen=True):
 
 
 class DriveRobot(Command, frozen=True):
-    """Report from the page which driving keys are held."""
+    """Report from the page which driving keys are held, and how the gamepad is deflected."""
 
     keys: Annotated[tuple[str, ...], msgspec.Meta(max_length=16)]
+    axes: Annotated[tuple[Deflection, ...], msgspec.Meta(max_length=4)] = ()
+    buttons: Annotated[tuple[Deflection, ...], msgspec.Meta(max_length=17)] = ()
+
+
+class ToggleReach(Command, frozen=True):
+    """Show handles at the end effectors of the selected env, which the arms follow, or hide them."""
+
+    key = "i"
+    context = "live"
 
 
 class ChooseMovedEnvs(Command, frozen=True):

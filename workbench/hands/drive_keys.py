@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 
@@ -54,16 +55,19 @@ def gripper(dimensions: Sequence[ActionDimension]) -> tuple[tuple[int, float, fl
 
 
 def driven_action(
-    dimensions: Sequence[ActionDimension], keys: Collection[str], yaw: float
+    dimensions: Sequence[ActionDimension], keys: Collection[str], yaw: float, sticks: Sequence[float] = ()
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """The numbers to set, and their values, while these keys are held.
 
     Args:
+        sticks: further deflections, -1 to 1, in the order of `PAIRS`: those of a gamepad.
         yaw: where the person looks: the angle from the x axis to the left, seen from above, in radians. ``w``
             moves an end effector in this direction, away from the person.
     """
     bound = bindings(dimensions)
-    amounts = np.array([(one.raises in keys) - (one.lowers in keys) for one in bound], float)
+    held = [(one.raises in keys) - (one.lowers in keys) for one in bound]
+    both = [key + stick for key, stick in zip_longest(held, sticks[: len(bound)], fillvalue=0.0)]
+    amounts = np.clip(np.array(both, float), -1.0, 1.0)
     axes = [one.name.rpartition("/")[2] for one in bound[:2]]
     if axes == ["x", "y"]:
         ahead, left = amounts[:2]

@@ -1,4 +1,4 @@
-"""Driving by keys: the button and its keys on the Run tab, and the sign in the bar."""
+"""Driving by keys and gamepad: the buttons and their keys on the Run tab, and the sign in the bar."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from workbench.hands.commands import DriveRobot, ToggleDriving
+from workbench.hands.commands import DriveRobot, ToggleDriving, ToggleReach
 from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, KeyBinding, bindings, gripper
+from workbench.hands.gamepad import GRIPPER_LABEL, LABELS, pad_amounts, pad_grips
+from workbench.hands.reach import why_no_arm
 from workbench.hands.state import Driven, Hands
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
@@ -22,7 +24,7 @@ from workbench.page.widgets.visitors import Visitor
 
 
 class DrivePanel(PagePart[SessionView]):
-    """The button *Drive by keys*, and what each key does while a person drives.
+    """The buttons *Drive by keys* and *Reach*, and what each key does while a person drives.
 
     Args:
         order: viser's order in its folder.
@@ -35,10 +37,11 @@ class DrivePanel(PagePart[SessionView]):
         self._html = server.gui.add_html("", order=order)
 
     def key(self, view: SessionView) -> object:
-        return view.of(Hands).driving, view.task_serial, view.selected_env
+        hands = view.of(Hands)
+        return hands.driving, hands.reach.shown, view.task_serial, view.selected_env
 
     def draw(self, view: SessionView) -> None:
-        driving = view.of(Hands).driving
+        driving, reaches = view.of(Hands).driving, view.of(Hands).reach.shown
         actions = () if view.task is None else view.task.actions
         button = Tool(
             "Stop driving" if driving else "Drive by keys",
@@ -47,14 +50,26 @@ class DrivePanel(PagePart[SessionView]):
             on=driving,
             off=not actions,
         )
+        armless = "" if view.task is None or view.task.arms else why_no_arm(view.task.armless)
+        reach = Tool(
+            "Reach",
+            ToggleReach(),
+            armless or with_key(ToggleReach),
+            on=reaches,
+            off=view.task is None or bool(armless),
+        )
         rows = _rows(bindings(actions), bool(gripper(actions))) if driving else []
-        self._html.content = tools_html([button]) + render("drive_keys", rows=rows)
+        self._html.content = tools_html([button, reach]) + render("drive_keys", rows=rows)
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case DriveRobot(keys=keys):
-                known = tuple(key for key in keys if key in KEYS)
-                self._session.happen(Driven(known, yaw_of(visitor.client.camera.wxyz)))
+            case DriveRobot(keys=keys, axes=axes, buttons=buttons):
+                known = tuple(
+                    key for key in KEYS if key in keys or (key == GRIPPER_KEY and pad_grips(buttons))
+                )
+                sticks = pad_amounts(axes, buttons)
+                yaw = yaw_of(visitor.client.camera.wxyz)
+                self._session.happen(Driven(known, yaw, sticks if any(sticks) else ()))
 
 
 class DrivingSign(PagePart[SessionView]):
@@ -73,7 +88,7 @@ class DrivingSign(PagePart[SessionView]):
             self._html.content = render(
                 "driving",
                 env=view.selected_env,
-                drives=json.dumps([name_of(DriveRobot), "keys", KEYS]),
+                drives=json.dumps([name_of(DriveRobot), "keys", KEYS, "axes", "buttons"]),
                 stop=ToggleDriving(),
                 hint=with_key(ToggleDriving),
             )
@@ -90,7 +105,11 @@ def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
     return float(np.arctan2(ahead[1], ahead[0]))
 
 
-def _rows(bound: Sequence[KeyBinding], has_gripper: bool) -> list[tuple[str, str]]:
-    """Keys and what they drive."""
-    rows = [(f"{key_in_words(one.raises)} / {key_in_words(one.lowers)}", one.name) for one in bound]
-    return [*rows, (key_in_words(GRIPPER_KEY), "open or close the gripper")] if has_gripper else rows
+def _rows(bound: Sequence[KeyBinding], has_gripper: bool) -> list[tuple[str, str, str]]:
+    """Keys, controls of a gamepad, and what they drive."""
+    rows = [
+        (f"{key_in_words(one.raises)} / {key_in_words(one.lowers)}", pad, one.name)
+        for one, pad in zip(bound, LABELS, strict=False)
+    ]
+    grip = key_in_words(GRIPPER_KEY), GRIPPER_LABEL, "open or close the gripper"
+    return [*rows, grip] if has_gripper else rows

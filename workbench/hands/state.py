@@ -6,16 +6,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from workbench.actions.sources import ActionSource
-from workbench.hands.commands import ToggleDriving
+from workbench.hands import reach as of_reach
+from workbench.hands.commands import ToggleDriving, ToggleReach
 from workbench.hands.drive_keys import GRIPPER_KEY, bindings, driven_action, gripper
+from workbench.hands.reach import ArmDragged, ArmsReleased, Reach
 from workbench.live.commands import PlayRun
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import Send, SettingsChanged, VersionLoaded
-from workbench.live.messages import EpisodeEnd, MoveBody, PullBody, SetSliderAction
+from workbench.live.messages import EpisodeEnd, MoveBody, PullBody, Reached, SetSliderAction
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
+from workbench.task.description import Stepped
 
-DOES: frozenset[type[Command]] = frozenset({ToggleDriving})
+DOES: frozenset[type[Command]] = frozenset({ToggleDriving, ToggleReach})
 """Commands that `apply` handles."""
 LET_GO_SECONDS = 0.3
 """Time after the last report of held keys after which they count as released: the page reports three times in it,
@@ -41,10 +44,11 @@ class BodyPulled:
 
 @dataclass(frozen=True)
 class Driven:
-    """A page reports the driving keys that are held."""
+    """A page reports the driving keys and the controls of a gamepad that are held."""
 
     keys: tuple[str, ...]
     yaw: float
+    sticks: tuple[float, ...] = ()
     """See `driven_action`."""
 
 
@@ -65,13 +69,17 @@ class Hands:
     """Source of actions and end of episodes before a person took over, which return at the end."""
     keys: tuple[str, ...] = ()
     """Keys that are held."""
+    sticks: tuple[float, ...] = ()
+    """Deflections of a gamepad that are held; empty for none."""
     number: int = 0
     """Reports so far."""
     closes: bool = False
     """Whether the gripper closes."""
+    reach: Reach = Reach()
+    """Arms that are led by their handles."""
 
 
-HandEvent = BodyMoved | BodyPulled | Driven | DrivingDue
+HandEvent = BodyMoved | BodyPulled | Driven | DrivingDue | ArmDragged | ArmsReleased | Reached
 Change = tuple[Hands, list[Any]]
 
 
@@ -84,14 +92,27 @@ def apply(hands: Hands, event: object, run: Run) -> Change:
     match event:
         case Asked(command=ToggleDriving()):
             return _stop(hands) if hands.driving else _start(hands, run)
-        case Driven(keys=keys, yaw=yaw) if hands.driving:
-            return _drive(replace(hands, number=hands.number + 1), run, keys, yaw)
-        case DrivingDue(number=hands.number) if hands.driving and hands.keys:
+        case Asked(command=ToggleReach()):
+            reach, requests = of_reach.toggle(hands.reach, run)
+            return replace(hands, reach=reach), requests
+        case Driven(keys=keys, yaw=yaw, sticks=sticks) if hands.driving:
+            return _drive(replace(hands, number=hands.number + 1), run, keys, yaw, sticks)
+        case DrivingDue(number=hands.number) if hands.driving and (hands.keys or hands.sticks):
             return _drive(hands, run, (), 0.0)
         case SettingsChanged(values={"action_source": source}) if hands.driving and source != "sliders":
-            return replace(hands, driving=False, keys=()), []
-        case VersionLoaded() if hands.driving and (run.task is None or not bindings(run.task.actions)):
-            return _stop(hands)
+            return _released(replace(hands, driving=False, keys=(), sticks=()))
+        case VersionLoaded():
+            hands = replace(hands, reach=of_reach.without(hands.reach))
+            if hands.driving and (run.task is None or not (bindings(run.task.actions) or hands.reach.shown)):
+                return _stop(hands)
+        case ArmDragged():
+            return _lead(hands, event, run)
+        case ArmsReleased():
+            return _released(hands)
+        case Reached():
+            return replace(hands, reach=of_reach.answered(hands.reach, event)), []
+        case Stepped() if hands.reach.targets:
+            return replace(hands, reach=of_reach.stepped(hands.reach, event)), []
         case BodyMoved() | BodyPulled():
             return hands, _handle(event, run)
     return hands, []
@@ -108,8 +129,14 @@ def _start(hands: Hands, run: Run) -> Change:
             f"{run.task.control_mode} takes absolute targets, which keys cannot hold. Choose a mode with delta or vel "
             "under Control on the Run tab, such as pd_ee_delta_pose."
         )
+    return _take_over(hands, run)
+
+
+def _take_over(hands: Hands, run: Run) -> Change:
+    """The sliders become the source of actions, and hold the robots still until a person moves one."""
     settings = run.settings
-    started = Hands(True, settings.action_source, settings.episode_end, number=hands.number)
+    started = replace(hands, driving=True, source=settings.action_source, episode_end=settings.episode_end)
+    started = replace(started, keys=(), sticks=(), closes=False)
     # An episode that ends by itself would take the robot out of the hand.
     changed = SettingsChanged({"action_source": "sliders", "episode_end": "continue"})
     hold = Send(SetSliderAction(tuple(range(run.num_envs)), (), ()))
@@ -119,22 +146,44 @@ def _start(hands: Hands, run: Run) -> Change:
 def _stop(hands: Hands) -> Change:
     """Give back to the source of actions from before."""
     back = SettingsChanged({"action_source": hands.source, "episode_end": hands.episode_end})
-    return replace(hands, driving=False, keys=()), [Then(back)]
+    stopped, requests = _released(replace(hands, driving=False, keys=(), sticks=()))
+    return stopped, [*requests, Then(back)]
 
 
-def _drive(hands: Hands, run: Run, keys: tuple[str, ...], yaw: float) -> Change:
+def _released(hands: Hands) -> Change:
+    """Let go of all arms."""
+    return replace(hands, reach=of_reach.without(hands.reach)), of_reach.let_go(hands.reach)
+
+
+def _lead(hands: Hands, event: ArmDragged, run: Run) -> Change:
+    """An arm follows its handles; while the envs play, a person takes over from the source of actions."""
+    _require_live(run)
+    effects: list[Any] = []
+    if run.playing and not hands.driving:
+        hands, effects = _take_over(hands, run)
+    reach, requests = of_reach.lead(hands.reach, event, run)
+    return replace(hands, reach=reach), [*effects, *requests]
+
+
+def _drive(
+    hands: Hands, run: Run, keys: tuple[str, ...], yaw: float, sticks: tuple[float, ...] = ()
+) -> Change:
     if run.task is None:
         return hands, []
-    dimensions, values = driven_action(run.task.actions, keys, yaw)
+    dimensions, values = driven_action(run.task.actions, keys, yaw, sticks)
     closes = hands.closes ^ (GRIPPER_KEY in keys and GRIPPER_KEY not in hands.keys)
     if closes != hands.closes:
         grips = gripper(run.task.actions)
         dimensions += tuple(k for k, _, _ in grips)
         values += tuple(closed if closes else opened for _, closed, opened in grips)
-    told: list[Any] = [Send(SetSliderAction((run.env,), dimensions, values))]
-    if keys:
+    told: list[Any] = [Send(SetSliderAction((run.env,), dimensions, values))] if dimensions else []
+    reach = hands.reach
+    if any(values[: len(bindings(run.task.actions))]):  # the keys take the arms out of the handles
+        told += of_reach.let_go(reach, run.env)
+        reach = of_reach.without(reach, run.env)
+    if keys or sticks:
         told.append(Later(LET_GO_SECONDS, DrivingDue(hands.number)))
-    return replace(hands, keys=keys, closes=closes), told
+    return replace(hands, keys=keys, sticks=sticks, closes=closes, reach=reach), told
 
 
 def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:

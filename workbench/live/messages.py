@@ -248,6 +248,23 @@ class PullBody:
 
 
 @dataclass(frozen=True)
+class ReachPose:
+    """Bring an arm's end effector to a pose by inverse kinematics; followed by a `Reached`. Dropped if the env has no such
+    arm."""
+
+    arm: str = ""
+    """Body name of the end effector; empty to let go of all arms of the env."""
+    env: int = 0
+    pose: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    """(7,) position and quaternion wxyz in the env's frame."""
+    how: Literal["follow", "try", "set"] = "follow"
+    """``follow``: in every control step by sliders, the action leads there; ``set``: put the joints there, at rest, followed
+    by a `Stepped` that has `Stepped.restored`; ``try``: only answer, and of several waiting requests only the last."""
+    origin: int = 0
+    """The server's number of the newest moment; returned unchanged."""
+
+
+@dataclass(frozen=True)
 class DrawPast:
     """Draw one env at a past moment without touching its simulation; followed by `PastPictures`."""
 
@@ -311,6 +328,7 @@ Request = (
     | EnterRecording
     | MoveBody
     | PullBody
+    | ReachPose
     | DrawPast
     | ListenForDebugger
     | Inspect
@@ -528,6 +546,25 @@ class SliderAction:
 
 
 @dataclass(frozen=True)
+class Reached:
+    """How near the joints of an arm can bring its end effector to the pose of a `ReachPose`."""
+
+    env: int
+    arm: str
+    how: Literal["follow", "try", "set"]
+    """As in the request."""
+    metres: float
+    degrees: float
+    """Position and rotation errors that remain."""
+    why: str
+    """Why the pose is out of reach, as text; empty if it is within."""
+    links: tuple[str, ...] = ()
+    """Body names of the robot's links; empty unless only an answer was requested."""
+    poses: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 7), np.float32))
+    """(L, 7) poses of these links with those joint positions, in the env's frame."""
+
+
+@dataclass(frozen=True)
 class RulesBroken:
     """Broken rules that do not stop the running version; sent when the findings change."""
 
@@ -554,6 +591,7 @@ Event = (
     | Answer
     | Progress
     | SliderAction
+    | Reached
     | Status
     | RulesBroken
 )

@@ -92,6 +92,16 @@ class ActionDimension:
 
 
 @dataclass(frozen=True)
+class ArmDescription:
+    """An arm of a robot."""
+
+    body: str
+    """Body name of the end effector."""
+    joints: tuple[str, ...]
+    """Names of the joints that move it, from the root on."""
+
+
+@dataclass(frozen=True)
 class TaskDescription:
     """A loaded task, for the page."""
 
@@ -139,6 +149,10 @@ class TaskDescription:
     """Names of the joints whose positions are in `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
     """Notices about a working task, as sentences."""
+    arms: tuple[ArmDescription, ...] = ()
+    """The arms of all robots."""
+    armless: tuple[str, ...] = ()
+    """Robots without an arm."""
     parse_cameras: str = "parse_camera_configs"
     """Name of the installed ManiSkill's function that parses what a camera hook returns."""
     outlier_rules: Mapping[str, Finding] = field(default_factory=dict)

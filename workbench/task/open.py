@@ -10,6 +10,7 @@ from typing import Any
 from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.envs import action_vector as actions
+from workbench.envs.arms import find_arms, without_arms
 from workbench.envs.backends import BackendUnavailable, find_renderer, keep_render_device, unused_gpu_text
 from workbench.envs.broken_rule import BrokenRule, NeedsOneEnv, class_is_installed, in_brackets, warn_of
 from workbench.envs.camera_data import CameraInfo
@@ -33,7 +34,7 @@ from workbench.pictures.render import (
 )
 from workbench.pictures.visibility import objects_to_see
 from workbench.task.blame import blamed, returns_check
-from workbench.task.description import ActionDimension, TaskDescription, TaskOptions
+from workbench.task.description import ActionDimension, ArmDescription, TaskDescription, TaskOptions
 from workbench.task.load import LoadedTask, import_modules, load_task, undo_load, with_late_imports
 from workbench.task.outlier_rules import rules_of_outliers
 from workbench.task.problem import Interrupted, TaskError, shorten
@@ -323,6 +324,8 @@ def describe(
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env),
         joints=joint_names(env),
+        arms=tuple(ArmDescription(arm.name, arm.joint_names) for arm in find_arms(env)),
+        armless=without_arms(env),
         parse_cameras=parse_cameras.__name__,
         made=describe_keywords(loaded.cls, env, given, loaded.default_kwargs, BaseEnv),
     )

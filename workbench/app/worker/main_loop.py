@@ -26,6 +26,7 @@ from workbench.envs.maniskill_private import mark_camera_configs
 from workbench.envs.step_result import StepResult
 from workbench.envs.task_drawings import drawings
 from workbench.envs.task_env import TaskEnv
+from workbench.hands.reach_worker import LedArms, set_arm
 from workbench.hands.worker import Hand, move_body
 from workbench.live.messages import (
     SCENE_KEPT,
@@ -46,6 +47,7 @@ from workbench.live.messages import (
     Progress,
     PullBody,
     Quit,
+    ReachPose,
     ReadPolicyAgain,
     ReloadReport,
     Reset,
@@ -117,6 +119,7 @@ class Worker:
         self._plans = WorkerPlans(self._line.waits)
         self._followed = FollowedPlan(self._line.send)
         self._hand = Hand()
+        self._arms = LedArms(self._line.send)
         self._one_planned_step = False
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
@@ -151,6 +154,7 @@ class Worker:
             EnterRecording: lambda request: self._task.guarded(partial(self._go, request)),
             MoveBody: lambda request: self._task.guarded(partial(self._move, request)),
             PullBody: self._hand.take,
+            ReachPose: self._reach,
             DrawPast: self._cameras.draw_past,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
@@ -177,6 +181,8 @@ class Worker:
             if self._playing and self._step_due(time.monotonic()):
                 self._pacer.spend()
                 self._task.run("stepping", partial(self._task.guarded, self._step_once))
+            if self._arms.is_asked:
+                self._task.run("stepping", partial(self._task.guarded, self._answer_reach))
             if self._cameras.placing_due:
                 self._task.run("stepping", self._cameras.place_waiting)
             began = time.monotonic()
@@ -321,6 +327,7 @@ class Worker:
         self._checks.close()
         self._plans.loaded(opened, None if report is None else report.level)
         self._followed.forget()
+        self._arms.forget()
         before, self._task.opened = self._task.opened, opened
         self._task.failed = False
         self._loaded_by, self._last = request, opened.first
@@ -498,6 +505,8 @@ class Worker:
             action = self._chooser.next_action(opened.env)
         before = self._last
         with blamed("step", opened.loaded, opened.env), self._hand.pulling(opened.env.env):
+            if self._chooser.by_sliders:
+                action = self._arms.lead(opened.env, action)
             step = opened.env.step(action)
         self._chooser.acted(action)
         self._rate.tick(time.monotonic())
@@ -533,6 +542,7 @@ class Worker:
             step = self._reset_with_seeds(opened.env, env_idx, seed)
         self._cameras.put_back()
         self._chooser.begin(env_idx)
+        self._arms.forget(env_idx)
         self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
         return step
 
@@ -573,6 +583,7 @@ class Worker:
         finally:
             self._cameras.put_back()
         self._chooser.begin(restored.env_idx, _led_there(request))
+        self._arms.forget(restored.env_idx)
         self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
@@ -582,6 +593,27 @@ class Worker:
             moved = move_body(opened.env, request)
         if moved is not None:
             step, restored = moved
+            self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
+
+    def _reach(self, request: ReachPose) -> None:
+        if request.arm and request.how == "set":
+            self._task.guarded(partial(self._set_arm, request))
+        else:
+            self._arms.take(request)
+
+    def _answer_reach(self, opened: OpenedTask) -> None:
+        with blamed("step", opened.loaded, opened.env):
+            self._arms.answer(opened.env)
+
+    def _set_arm(self, request: ReachPose, opened: OpenedTask) -> None:
+        self._cameras.settle()  # the env gets a new physics scene
+        with blamed("restore", opened.loaded, opened.env):
+            found = set_arm(opened.env, request)
+        if found is not None:
+            step, restored, reached = found
+            self._chooser.begin(restored.env_idx)
+            self._arms.forget(restored.env_idx)
+            self._line.send(reached)
             self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
 
     def _throttled_status(self, text: Callable[..., str]) -> Callable[..., None]:
@@ -688,6 +720,7 @@ _DOING: dict[type, Doing] = {
     Restore: "resetting",
     EnterRecording: "resetting",
     MoveBody: "resetting",
+    ReachPose: "resetting",
     ReadPolicyAgain: "importing the policy",
     WarmUp: "warming up",
     ListTasks: "starting",
