@@ -278,14 +278,15 @@ def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
             wanted = torch.hstack([pose.p, matrix_to_euler_angles(quaternion_to_matrix(pose.q), "XYZ")])
         held = unscaled(part, wanted.cpu().numpy())
     else:
-        qpos = controller.qpos
+        qpos: Any = controller.qpos
         controlled = getattr(controller, "control_joint_indices", None)
         if controlled is not None:
             qpos = qpos[:, controlled.long()]
         if isinstance(controller, PDJointPosVelController):
             qpos = torch.cat([qpos, torch.zeros_like(qpos)], dim=1)
         if controller.config.normalize_action:
-            low, high = controller.action_space_low, controller.action_space_high
+            low: Any = controller.action_space_low
+            high: Any = controller.action_space_high
             qpos = (2 * qpos - (high + low)) / (high - low)
         held = qpos.cpu().numpy()
     return np.clip(held, part.low, part.high).astype(np.float32)

@@ -333,6 +333,7 @@ def _pose_values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -
     """Numbers of an end-effector controller."""
     controller: Any = part.controller
     row, turns = arm.row(of), isinstance(controller, PDEEPoseController)
+    assert row is not None, "the env has the robot"
     base = _pose(controller.root_link.pose.raw_pose[row])
     link = maniskill_private.objects_of(arm.link)[row].index
     wanted = base.inv() * _pose_of(goal.poses[link, :3], goal.poses[link, 3:])
