@@ -94,7 +94,7 @@ def test_findings_are_printed_by_degree_with_line_and_reason(
     stop, warn = ended.out.index("stop: 1 finding\n"), ended.out.index("warn: 1 finding\n")
     assert stop < ended.out.index(f"bad.py:{line}: success-at-reset (stop") < warn
     assert warn < ended.out.index(f"bad.py:{line}: success-and-fail (warn")
-    assert f"Otherwise: {RULES['success-at-reset'].otherwise}" in ended.out
+    assert f"Why: {RULES['success-at-reset'].otherwise}" in ended.out
     assert '      "success": (distance < 1)' in ended.out and "workbench help success-at-reset" in ended.out
     silenced = line_of(place / "bad.py", "def compute_normalized_dense_reward")
     assert f"silenced bad.py:{silenced}: reward-normalized: {REASON}" in ended.out

@@ -144,10 +144,10 @@ def slowed_by(view: SessionView) -> tuple[str, str] | None:
         envs = counted(len(view.of(RecordingStatus).env_idx), "env")
         what = f"recording {cameras} of {envs} in every step takes {recorded:.0%} of the time"
         advice = "Save what I just saw (Episodes) records afterwards, and costs nothing while playing."
-        return f"{cameras} recorded in every step", f"{rate}: {what}. {advice}"
+        return "recording", f"{rate}: {what}. {advice}"
     cameras = counted(len(view.settings.cameras), "camera")
     what = f"drawing the {cameras} that this page shows takes {watched:.0%} of the time"
-    return f"{cameras} drawn for the page", f"{rate}: {what}. Untick them on the Cameras tab."
+    return "camera pictures", f"{rate}: {what}. Untick them on the Cameras tab."
 
 
 def _state(view: SessionView, busy: Busy | None) -> str:

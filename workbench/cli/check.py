@@ -216,7 +216,7 @@ def _print_finding(finding: Finding, root: Path, style: str) -> None:
     _print(f"  {_safe(finding.message)}")
     if finding.code:
         _print(f"      [bold]{_safe(finding.code)}[/]")
-    _print(f"  Otherwise: {escape(RULES[finding.rule].otherwise)}")
+    _print(f"  Why: {escape(RULES[finding.rule].otherwise)}")
     _print(f"  [dim]workbench help {finding.rule}[/]\n")
 
 

@@ -257,8 +257,8 @@ def _test_case(env_id: str, name: str, seconds: float) -> ElementTree.Element:
 def _text(finding: Finding, root: Path) -> str:
     place = place_text(finding.file and shown_path(finding.file, root), finding.line)
     code = f"\n    {finding.code}" if finding.code else ""
-    otherwise = RULES[finding.rule].otherwise
-    return f"{place}{finding.rule} ({finding.degree})\n{finding.message}{code}\nOtherwise: {otherwise}"
+    why = RULES[finding.rule].otherwise
+    return f"{place}{finding.rule} ({finding.degree})\n{finding.message}{code}\nWhy: {why}"
 
 
 def xml_text(text: str) -> str:

@@ -189,7 +189,7 @@ def _print_verdict(verdict: RewardVerdict) -> None:
     rule = RULES[verdict.rule]
     out.print(f"\n[yellow]{rule.id}[/] ({rule.degree})", soft_wrap=True)
     out.print(f"  {escape(plain_text(verdict.message))}", soft_wrap=True)
-    out.print(f"  Otherwise: {escape(rule.otherwise)}", soft_wrap=True)
+    out.print(f"  Why: {escape(rule.otherwise)}", soft_wrap=True)
     seeds = ", ".join(map(str, verdict.seeds[:12])) + (" ..." if len(verdict.seeds) > 12 else "")
     out.print(f"  [dim]seeds {seeds}; workbench help {rule.id}[/]", soft_wrap=True)
 

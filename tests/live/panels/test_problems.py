@@ -217,17 +217,17 @@ def test_a_slow_machine_is_reported_with_the_cause(live: Live) -> None:
     assert "cannot reach it" in status(live, slow)
     assert "cannot reach it" not in status(live, running(4, speed=4.0, real_time_factor=3.9))
     assert "cannot reach it" not in status(live, running(4, speed=float("inf"), real_time_factor=1.2))
-    assert "recorded" in status(live, replace(slow, recorded_share=0.9, watched_share=0.4))
-    assert "drawn for the page" in status(live, replace(slow, recorded_share=0.1, watched_share=0.4))
+    assert "slow: recording" in status(live, replace(slow, recorded_share=0.9, watched_share=0.4))
+    assert "slow: camera pictures" in status(live, replace(slow, recorded_share=0.1, watched_share=0.4))
 
 
 @pytest.mark.parametrize("word", ["running", "paused", "loading"])
-def test_error_and_stale_are_marks_next_to_the_state(live: Live, word: Any) -> None:
+def test_error_and_old_code_are_marks_next_to_the_state(live: Live, word: Any) -> None:
     status_text = status(
         live, running(4, state=word, playing=word == "running", stale=True, problem=problem())
     )
     assert f"<b>{word}</b>" in status_text and status_text.count(">error</span>") == 1
-    assert (">stale</span>" in status_text) is (word != "loading")
+    assert (">old code</span>" in status_text) is (word != "loading")
 
 
 def test_the_status_line_shows_the_planning_time(live: Live) -> None:

@@ -115,3 +115,15 @@ def test_of_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     assert sum(style == "fail" for _, style, _ in drawn) == 100
     both, _ = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
+
+
+def test_an_event_that_lasts_several_steps_has_one_mark() -> None:
+    late = ((150, TRUNCATED), (151, TRUNCATED), (152, TRUNCATED), (153, TRUNCATED | SUCCESS), (160, TRUNCATED))
+    html, _ = strip_html(strip(events=late), running(4, timeline=past()))
+    assert [(place, style) for place, style, _ in marks(html)] == [
+        (50.0, "limit"),
+        (53.0, "success"),
+        (60.0, "limit"),
+    ]
+    constant, _ = strip_html(strip(values=np.full(101, 0.5, np.float32)), running(4, timeline=past()))
+    assert constant.count(">0.5<") == 1

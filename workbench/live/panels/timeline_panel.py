@@ -378,11 +378,14 @@ def strip_values(
 
 
 def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
-    """Tick, style and name of each mark. Where several events fall on one place, the first of `FLAGS` is drawn."""
-    rank, names = list(FLAGS), dict(strip.branches)
+    """Tick, style and name of each mark. Where several events fall on one place, the first of `FLAGS` is drawn; of an event
+    that lasts several steps, such as an episode that continues after its time limit, only the first step."""
+    rank, names, events = list(FLAGS), dict(strip.branches), dict(strip.events)
     marks: dict[int, tuple[int, int, str]] = {}
     for tick, flags in strip.events:
         flag = next(flag for flag in rank if flags & flag)
+        if flags == events.get(tick - 1):
+            continue
         place = MAX_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
         if place not in marks or rank.index(flag) < rank.index(marks[place][1]):
             name = NAMES[FLAGS[flag]]
