@@ -15,8 +15,8 @@ from workbench.hands.reach import why_no_arm
 from workbench.hands.state import Driven, Hands
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
-from workbench.page.command import Command, name_of
-from workbench.page.widgets.keys_and_palette import key_in_words, with_key
+from workbench.page.command import SHORT_NAMES, Command, key_in_words, name_of
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tools_html
@@ -108,8 +108,8 @@ def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
 def _rows(bound: Sequence[KeyBinding], has_gripper: bool) -> list[tuple[str, str, str]]:
     """Keys, controls of a gamepad, and what they drive."""
     rows = [
-        (f"{key_in_words(one.raises)} / {key_in_words(one.lowers)}", pad, one.name)
+        (f"{key_in_words(one.raises, SHORT_NAMES)} / {key_in_words(one.lowers, SHORT_NAMES)}", pad, one.name)
         for one, pad in zip(bound, LABELS, strict=False)
     ]
-    grip = key_in_words(GRIPPER_KEY), GRIPPER_LABEL, "open or close the gripper"
+    grip = key_in_words(GRIPPER_KEY), GRIPPER_LABEL, "gripper"
     return [*rows, grip] if has_gripper else rows

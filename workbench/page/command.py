@@ -24,6 +24,8 @@ KEY_NAMES = {
     "escape": "Esc",
     "delete": "Delete",
 }
+SHORT_NAMES = {**KEY_NAMES, "arrowleft": "←", "arrowright": "→", "arrowup": "↑", "arrowdown": "↓"}
+"""Names of keys for a narrow list."""
 MODIFIERS = "ctrl", "alt", "shift"
 """Modifiers, in the order in which the name of a key lists them. On a Mac ``ctrl`` is also Cmd."""
 
@@ -123,10 +125,10 @@ def is_key(key: str) -> bool:
     return known and held == [name for name in MODIFIERS if name in held]
 
 
-def key_in_words(key: str) -> str:
+def key_in_words(key: str, names: Mapping[str, str] = KEY_NAMES) -> str:
     """The key as the page and the docs show it: ``Space``, ``Shift+R``; empty for no key."""
     if not key:
         return ""
     *held, last = key.split("+")
-    name = KEY_NAMES.get(last, last.upper())
+    name = names.get(last, last.upper())
     return "+".join([*(one.capitalize() for one in held), name])

@@ -66,7 +66,7 @@ class CurvesPanel(MomentPart):
         self._server, self._session = server, session
         gui = server.gui
         self._beside: Literal["last", "batch"] = "last"
-        self._over = choice(server, "Over", ChooseBeside, "beside", BESIDE, self._beside)
+        self._over = choice(server, "Compare with", ChooseBeside, "beside", BESIDE, self._beside)
         self._choice_folder = gui.add_folder(CHOICE, expand_by_default=False, visible=False)
         with self._choice_folder:
             self._choice = gui.add_html("")

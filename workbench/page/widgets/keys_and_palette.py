@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import viser
 
 from workbench.machine.kept_choices import kept_choices
-from workbench.page.command import Command, CommandList, key_in_words
+from workbench.page.command import KEY_NAMES, SHORT_NAMES, Command, CommandList, key_in_words
 from workbench.page.commands import CloseHints, ShowTab
 from workbench.page.door.viser_private import places
 from workbench.page.widgets.templates import render
@@ -24,10 +24,14 @@ def with_key(kind: type[Command], hint: str = "") -> str:
     return f"{hint or kind.help()} ({key})" if key else hint or kind.help()
 
 
-def key_rows(commands: CommandList, kinds: Collection[type[Command]]) -> dict[str, list[tuple[str, str]]]:
+def key_rows(
+    commands: CommandList, kinds: Collection[type[Command]], names: Mapping[str, str] = KEY_NAMES
+) -> dict[str, list[tuple[str, str]]]:
     """Key and help of each command that has a key, by the heading of its group."""
     groups = {
-        heading: [(key_in_words(kind.key), kind.help()) for kind in group if kind.key and kind in kinds]
+        heading: [
+            (key_in_words(kind.key, names), kind.help()) for kind in group if kind.key and kind in kinds
+        ]
         for heading, group in commands.groups.items()
     }
     return {heading: rows for heading, rows in groups.items() if rows}
@@ -56,7 +60,7 @@ def register(
     server.gui.add_html(
         render(
             "all_keys",
-            groups=key_rows(visitors.commands, kinds),
+            groups=key_rows(visitors.commands, kinds, SHORT_NAMES),
             keys=json.dumps(keys),
             contexts=contexts,
         ),
