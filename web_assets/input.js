@@ -16,6 +16,7 @@
 //   data-title="PushCube"                    title of the browser's tab; without one the last title stays
 //   data-field='["set_seed", {}, "seed"]'    command, its other fields, and the field for the value: committed on Enter or blur, when an
 //                                            option is chosen, or (data-live) on every input; Enter sends data-enter
+//     data-done="set_joint"                    command, with the same fields, for the value at the end of a slider's drag
 //     data-number="[0, null, 1, true]"         a number: minimum, maximum, step of an arrow key, whether it is an integer
 //   data-drive='["drive_robot", "keys", ["w"], "axes", "buttons"]'  while this element is in the page, these keys drive: the
 //                                            command's field has the held ones, sent when they change and every 100 ms; the last
@@ -474,9 +475,10 @@
   // Between the reply and the next drawing the page has the server's old value: without this an input would jump back to it.
   const entered = new Map(); // data-field -> [shown value, time until which it stays]
 
-  function typed(input) {
+  function typed(input, isLive = false) {
     const of = input.dataset.field;
-    const [name, fields, field] = JSON.parse(of);
+    const [live, fields, field] = JSON.parse(of);
+    const name = (!isLive && input.dataset.done) || live;
     edited.delete(input);
     const value = valueOf(input);
     if (value === undefined) return;
@@ -502,10 +504,10 @@
   addEventListener("input", ({ target }) => {
     if (!target.dataset?.field) return;
     edited.add(target);
-    if ("live" in target.dataset) typed(target);
+    if ("live" in target.dataset) typed(target, true);
   }, true);
   addEventListener("change", ({ target }) => {
-    if (!target.dataset?.field || "live" in target.dataset) return;
+    if (!target.dataset?.field || ("live" in target.dataset && !target.dataset.done)) return;
     typed(target);
     if (byPointer && !target.matches(TYPED_INTO)) target.blur();
   }, true);

@@ -26,6 +26,8 @@ class SeenField:
     options: dict[str, Any] = field(default_factory=dict)
     bounds: tuple[float, float] | None = None
     hint: str = ""
+    done: str = ""
+    """Name of the command that an entered value, or the end of a drag, sends."""
 
     @property
     def value(self) -> Any:
@@ -37,7 +39,9 @@ class SeenField:
     def command(self, entered: Any, at: int = 0) -> Command:
         """The command that entering this value sends. Raises `Refused`."""
         name, fields, into = self.asks[at]
-        return COMMANDS.decode(name, {**fields, into: self.options[entered] if self.options else entered})
+        return COMMANDS.decode(
+            self.done or name, {**fields, into: self.options[entered] if self.options else entered}
+        )
 
 
 @dataclass
@@ -87,6 +91,7 @@ class Controls(HTMLParser):
                 self.fields.append(self._field)
             self._field.names.append(has["name"])
             self._field.asks.append(tuple(json.loads(has["data-field"])))
+            self._field.done = has.get("data-done", "")
         if tag in _VOID:
             return
         button = None

@@ -9,10 +9,11 @@ import pytest
 
 from tests.drive.live import Live, StubSession
 from tests.drive.panels import Panels
-from tests.drive.scenes import running
+from tests.drive.scenes import changed, running
 from workbench.hands.commands import ChooseMovedEnvs, SetBodyPosition, ToggleHandles
 from workbench.hands.panel import HandsPanel
 from workbench.hands.state import BodyMoved, BodyPulled
+from workbench.hands.state import Hands as State
 from workbench.live.commands import SelectBody
 from workbench.live.messages import PullBody
 from workbench.page.command import Refused
@@ -114,6 +115,8 @@ def test_a_typed_coordinate_moves_the_selected_body_in_one_env_or_in_all(live_pa
     moved = live_page.asked[-1]
     assert isinstance(moved, BodyMoved) and moved.env_idx == (2,) and moved.pose[2] == 0.5
     live_page.do(ChooseMovedEnvs(all_envs=True))
+    assert live_page.asked[-1] == ChooseMovedEnvs(all_envs=True)
+    live_page.show(changed(view, hands=State(all_envs=True)))
     live_page.do(SetBodyPosition(of="x", to=0.1))
     assert live_page.asked[-1].env_idx == (0, 1, 2)
 

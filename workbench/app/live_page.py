@@ -28,6 +28,8 @@ from workbench.checks.panel import TAB as CHECKS
 from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
 from workbench.hands.drive_panel import DrivePanel, DrivingSign
+from workbench.hands.joints_panel import TITLE as JOINTS
+from workbench.hands.joints_panel import JointsPanel, with_dragged_joint
 from workbench.hands.look import BodyView
 from workbench.hands.panel import HandsPanel
 from workbench.hands.reach_panel import ReachPanel
@@ -111,7 +113,7 @@ PICTURES_HINT = (
     "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
 )
 PANEL_WIDTH_PIXELS = 372
-ENVS_TAB, REWARD, LOG, ALL_PICTURES = "Envs", "Reward", "Log", "All pictures"
+RUN, ENVS_TAB, REWARD, LOG, ALL_PICTURES = "Run", "Envs", "Reward", "Log", "All pictures"
 ENVS_WIDTHS_PIXELS = 220, 640
 """Minimum and maximum width of the table of envs."""
 ENVS_SHARE = 0.2
@@ -210,6 +212,7 @@ class Page:
         for part in self._reward:
             self._parts.add(part, lambda view: self._is_shown(REWARD, view))
         self._parts.add(self._studio, lambda view: self._is_shown(CAMERAS, view))
+        self._parts.add(self._joints, lambda view: self._is_shown(RUN, view))
 
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._hover_mark = BodyMark(server, "/hovered_body", HOVER_COLOUR)
@@ -231,15 +234,16 @@ class Page:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)
 
     def _add_tabs(self, dark: bool) -> list[PagePart[SessionView]]:
-        """Add the tabs of the right dock; returns their parts, except those of the Cameras and Reward tabs."""
+        """Add the tabs of the right dock; returns their parts, except those that `_is_shown` limits."""
         server, session, clock = self._server, self._session, self._clock
         tabs = server.gui.add_tab_group()
-        with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
+        with tabs.add_tab(RUN, viser.Icon.PLAYER_PLAY):
             self._hints = add_hints(server)
             self._run = RunPanel(server, session)
             with self._run.actions:
                 drive = DrivePanel(server, session, self._run.below_mode)
                 self._reach = ReachPanel(server, session, self._run.below_mode + 0.1)
+            self._joints = JointsPanel(server, self._run.actions.order + 0.5)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
             self._view_panel = ViewPanel(server, dark, self._view_choice)
@@ -401,6 +405,8 @@ class Page:
             self._envs.unfold()
         elif panel == CAMERAS:
             self._studio.unfold()
+        elif panel == JOINTS:
+            self._joints.unfold()
 
     def _fit_envs(self) -> None:
         """Set the table's width to the width of its columns. Done once for each page width, because the user
@@ -469,7 +475,8 @@ class Page:
         if collisions := self._view_choice.collisions and len(geometry.collisions) > 0:
             geometry = geometry.as_collisions
         looks = self._in_software.looks(self._view_panel.looks, geometry, self._layout, one)
-        poses = self._reach.moved(view, self._hands.moved(geometry, step.poses))
+        poses = with_dragged_joint(view, self._hands.moved(geometry, step.poses))
+        poses = self._reach.moved(view, poses)
         built = (one, looks, collisions)
         if built != self._built:
             self._built = built

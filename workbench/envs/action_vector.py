@@ -248,11 +248,20 @@ def _dimension_names(controller: Any) -> list[str]:
     if isinstance(controller, PDEEPosController):
         names: list[str] = list(_EE_AXES)
     else:
-        names = [joint.name for joint in getattr(controller, "joints", ())]
-        controlled = getattr(controller, "control_joint_indices", None)
-        if controlled is not None:
-            names = [names[i] for i in controlled.tolist()]
+        names = [joint.name for joint in _controlled_joints(controller)]
     return names[:count] if len(names) >= count else [f"{i}" for i in range(count)]
+
+
+def _controlled_joints(controller: Any) -> list[Any]:
+    """The controller's joints, without those that mimic another joint."""
+    joints = [*getattr(controller, "joints", ())]
+    controlled = getattr(controller, "control_joint_indices", None)
+    return joints if controlled is None else [joints[i] for i in controlled.tolist()]
+
+
+def target_joints(part: ActionPart) -> list[Any]:
+    """The joints whose absolute positions the numbers of this part are; empty for any other controller."""
+    return _controlled_joints(part.controller) if _is_absolute(part.controller) else []
 
 
 def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:

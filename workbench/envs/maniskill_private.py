@@ -455,6 +455,16 @@ def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
     env.scene._reset_mask = mask
 
 
+@contextmanager
+def setting_only(env: BaseEnv, env_idx: list[int]) -> Iterator[None]:
+    """Context in which ManiSkill's setters write these envs only; their rows are in ascending order of the envs."""
+    set_reset_mask(env, env_idx)
+    try:
+        yield
+    finally:
+        set_reset_mask(env, list(range(env.num_envs)))
+
+
 def keep_observation(env: BaseEnv, obs: Any) -> None:
     """Set ``_last_obs``, as ``reset`` and ``step`` do."""
     env._last_obs = obs

@@ -42,10 +42,14 @@ class KeptControllers:
             (value.raw_pose if isinstance(value, Pose) else value)[self._rows] = rows
 
 
-def active_controllers(env: Any) -> list[BaseController]:
-    """The controllers in use, with each combined controller replaced by its parts; empty without a robot."""
+def active_controllers(env: Any, robots: list[Any] | None = None) -> list[BaseController]:
+    """The controllers in use, with each combined controller replaced by its parts; empty without a robot.
+
+    Args:
+        robots: the agents whose controllers are wanted; by default all.
+    """
     single: list[BaseController] = []
-    for agent in agents(env):
+    for agent in agents(env) if robots is None else robots:
         combined = isinstance(agent.controller, CombinedController)
         single += agent.controller.controllers.values() if combined else [agent.controller]
     return single

@@ -74,22 +74,25 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     _write_controllers(env, states)
 
 
-def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
+def settle_robot(env: Any, env_idx: Sequence[int], robot: Any = None) -> None:
     """Set controllers and drive targets of these envs' robots to the current joint positions.
 
     ``get_state_dict`` includes controllers only if they keep their own target. Without this function, the
     other controllers would drive a restored robot back to its old position.
+
+    Args:
+        robot: the agent of a robot; None for all robots of the envs.
     """
     chosen = [int(i) for i in env_idx]
-    if env.agent is None or not chosen:
+    robots = maniskill_private.agents(env) if robot is None else [robot]
+    if not robots or not chosen:
         return
-    maniskill_private.set_reset_mask(env, chosen)
-    for controller in active_controllers(env):
-        controller.reset()
-    maniskill_private.set_reset_mask(env, list(range(env.num_envs)))
+    with maniskill_private.setting_only(env, chosen):
+        for controller in active_controllers(env, robots):
+            controller.reset()
     targets = env.scene.px.cuda_articulation_target_qpos.torch()
     velocities = env.scene.px.cuda_articulation_target_qvel.torch()
-    for agent in maniskill_private.agents(env):
+    for agent in robots:
         qpos = agent.robot.get_qpos()
         rows = maniskill_private.data_rows_of_articulation(agent.robot)[chosen].long()
         targets[rows, : qpos.shape[1]] = qpos[chosen]

@@ -1,4 +1,4 @@
-"""Commands that move the selected body."""
+"""Commands that move the selected body, the robot's joints, and the robot itself."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ Axis = Literal["x", "y", "z"]
 Angle = Literal["roll", "pitch", "yaw"]
 Deflection = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+RobotName = Annotated[str, msgspec.Meta(max_length=256)]
+JointNumber = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class SetBodyPosition(Command, frozen=True):
@@ -70,7 +72,7 @@ class ToggleReach(Command, frozen=True):
 
 
 class ChooseMovedEnvs(Command, frozen=True):
-    """Move the body in the selected env, or in all envs."""
+    """Move the body or the robot in the selected env, or in all envs."""
 
     all_envs: bool
 
@@ -106,3 +108,28 @@ class MeasureFrom(Command, frozen=True):
     """Measure distances from the selected body to the next one that is selected."""
 
     context = "live"
+
+
+class DragJoint(Command, frozen=True):
+    """Show the robot with this joint at a position while its slider is dragged; while playing, drive the joint there."""
+
+    robot: RobotName
+    joint: JointNumber
+    to: Number
+    """Degrees for a revolute joint, metres for a prismatic one."""
+
+
+class SetJoint(Command, frozen=True):
+    """Put a joint at a position; while playing, drive the joint there."""
+
+    robot: RobotName
+    joint: JointNumber
+    to: Number
+    """Degrees for a revolute joint, metres for a prismatic one."""
+
+
+class UseKeyframe(Command, frozen=True):
+    """Put the robot into this keyframe of its agent."""
+
+    robot: RobotName
+    name: Annotated[str, msgspec.Meta(max_length=256)]

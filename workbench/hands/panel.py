@@ -24,7 +24,7 @@ from workbench.hands.commands import (
     ToggleHandles,
 )
 from workbench.hands.resets import ResetCloud
-from workbench.hands.state import BodyMoved, BodyPulled, why_not_moved, why_not_pulled
+from workbench.hands.state import BodyMoved, BodyPulled, Hands, why_not_moved, why_not_pulled
 from workbench.live.messages import PullBody
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
@@ -102,7 +102,7 @@ class HandsPanel(PagePart[SessionView]):
         order: viser's order of the fold in its tab.
     """
 
-    does = (SetBodyPosition, SetBodyAngle, ToggleHandles, ChooseMovedEnvs)
+    does = (SetBodyPosition, SetBodyAngle, ToggleHandles)
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class HandsPanel(PagePart[SessionView]):
         order: float | None = None,
     ) -> None:
         self._server, self._session, self._body = server, session, body
-        self._handles_on = self._all_envs = False
+        self._handles_on = False
         self.selected: Selected | None = None
         """The selected body as it is drawn; None if none is selected, or nothing of it is visible."""
         self._drag: _Drag | None = None
@@ -124,15 +124,7 @@ class HandsPanel(PagePart[SessionView]):
             self._note = server.gui.add_html("", visible=False)
             self._position = self._row("Position", SetBodyPosition, XYZ, "In the env's frame, metres.", 0.01)
             self._angles = self._row("Rotation", SetBodyAngle, ANGLES, "Degrees about fixed axes.", 1.0)
-            self._scope = choice(
-                server,
-                "In",
-                ChooseMovedEnvs,
-                "all_envs",
-                {"this env": False, "all envs": True},
-                False,
-                hint="Whether a move applies to the selected env or to all envs.",
-            )
+            self._scope = scope_choice(server)
             self._tools = server.gui.add_html("")
             self._spread = server.gui.add_html("", visible=False)
         self._points = InView(
@@ -167,7 +159,7 @@ class HandsPanel(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         shown = view.step_serial, view.task_serial, view.selected_env, self._body(), id(self._drag)
-        return *shown, self._handles_on, self._all_envs, view.of(ResetCloud).serial
+        return *shown, self._handles_on, view.of(Hands).all_envs, view.of(ResetCloud).serial
 
     def draw(self, view: SessionView) -> None:
         task, step = view.task, view.step
@@ -180,7 +172,7 @@ class HandsPanel(PagePart[SessionView]):
         degrees = [round(angle, 2) for angle in rpy_of(known.pose[3:])]
         self._position.show([round(float(value), 4) for value in known.pose[:3]], off=bool(why))
         self._angles.show(degrees, off=bool(why))
-        self._scope.show(self._all_envs, off=bool(why))
+        self._scope.show(view.of(Hands).all_envs, off=bool(why))
         note = why or HINT
         if known.kind == "link":
             note = why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu") or why
@@ -200,8 +192,6 @@ class HandsPanel(PagePart[SessionView]):
         match command:
             case ToggleHandles():
                 self._handles_on = not self._handles_on
-            case ChooseMovedEnvs(all_envs=all_envs):
-                self._all_envs = all_envs
             case SetBodyPosition(of=axis, to=metres):
                 pose = self._required().pose.copy()
                 pose[XYZ.index(axis)] = metres
@@ -222,8 +212,8 @@ class HandsPanel(PagePart[SessionView]):
         """Put the selected body at a pose in the env's frame. Raises `Refused`."""
         of = self._required()
         view = self._session.view()
-        envs = range(view.task.num_envs) if self._all_envs and view.task is not None else (of.env,)
-        self._session.happen(BodyMoved(of.body, tuple(envs), tuple(map(float, pose))))
+        envs = envs_of_move(view.of(Hands), of.env, 0 if view.task is None else view.task.num_envs)
+        self._session.happen(BodyMoved(of.body, envs, tuple(map(float, pose))))
 
     def follow(self, view: SessionView) -> None:
         """Let go if the page that drags has closed, or if the pulled env was reset."""
@@ -420,6 +410,24 @@ class HandsPanel(PagePart[SessionView]):
         drag, self._drag = self._drag, None
         if drag is not None and drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))
+
+
+def scope_choice(server: viser.ViserServer) -> Field:
+    """The choice of the envs that a move applies to."""
+    return choice(
+        server,
+        "In",
+        ChooseMovedEnvs,
+        "all_envs",
+        {"this env": False, "all envs": True},
+        False,
+        hint="Whether a move applies to the selected env or to all envs.",
+    )
+
+
+def envs_of_move(hands: Hands, env: int, num_envs: int) -> tuple[int, ...]:
+    """The envs that a move in this env applies to."""
+    return tuple(range(num_envs)) if hands.all_envs else (env,)
 
 
 def _can_be_dragged(known: Selected, view: SessionView) -> bool:

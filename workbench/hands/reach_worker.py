@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from workbench.envs import maniskill_private
 from workbench.envs.arms import Arm, ArmPose, find_arms, solve, steer
 from workbench.envs.scene.scene_index import scene_index
-from workbench.envs.simulation.cpu_system import batched_system
-from workbench.envs.snapshots.snapshot import begin_anew
 from workbench.envs.step_result import StepResult
 from workbench.envs.task_env import TaskEnv
-from workbench.episodes.recorded_state import settle_robot
+from workbench.hands.worker import put_joints
 from workbench.live.messages import Reached, ReachPose
 from workbench.task.description import Restored
 
@@ -105,36 +103,18 @@ class LedArms:
 
 
 def set_arm(task: TaskEnv, request: ReachPose) -> tuple[StepResult, Restored, Reached] | None:
-    """Put an arm at the joint positions nearest to a pose, at rest; None if the env has no such arm.
-
-    The env gets a new physics scene, so the state is an exact point of the history (`begin_anew`).
-    """
+    """Put an arm at the joint positions nearest to a pose, at rest; None if the env has no such arm."""
     env, of = task.env, request.env
     arm = _arm(env, request)
     if arm is None:
         return None
     goal = solve(arm, of, np.asarray(request.pose, np.float64))
-    robot, row = arm.articulation, arm.row(of)
-    own = torch.as_tensor(maniskill_private.envs_of(robot) == of, device=env.device)
-    maniskill_private.set_reset_mask(env, [of])
-    qpos = robot.get_qpos()[own].clone()
-    qpos[0] = torch.as_tensor(goal.qpos, dtype=qpos.dtype, device=qpos.device)
-    robot.set_qpos(qpos)
-    robot.set_qvel(torch.zeros_like(qpos))
-    maniskill_private.set_reset_mask(env, list(range(env.num_envs)))
-    assert row is not None, "`_arm` found it"
-    maniskill_private.apply_and_fetch(env)
-    settle_robot(env, [of])
-    maniskill_private.apply_and_fetch(env)
-    if batched_system(env.scene) is not None:
-        begin_anew(env, [of])
+    agent = next(agent for agent in maniskill_private.agents(env) if agent.robot is arm.articulation)
+    qpos = torch.as_tensor(goal.qpos, dtype=torch.float32, device=env.device)[None]
+    step = put_joints(task, agent, [of], qpos)
     told = _told(env, arm, request, goal)
     how = f"{request.arm} was moved by hand."
-    return (
-        task.rescore(),
-        Restored((of,), (of,), request.origin, None, {}, how=how, moved=request.arm),
-        told,
-    )
+    return step, Restored((of,), (of,), request.origin, None, {}, how=how, moved=request.arm), told
 
 
 def _arm(env: Any, request: ReachPose) -> Arm | None:

@@ -6,19 +6,38 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from workbench.actions.sources import ActionSource
+from workbench.envs.robots import Joint, Robot
 from workbench.hands import reach as of_reach
-from workbench.hands.commands import ToggleDriving, ToggleReach
+from workbench.hands.commands import (
+    ChooseMovedEnvs,
+    DragJoint,
+    SetJoint,
+    ToggleDriving,
+    ToggleReach,
+    UseKeyframe,
+)
 from workbench.hands.drive_keys import GRIPPER_KEY, bindings, driven_action, gripper
+from workbench.hands.joints import position_of
 from workbench.hands.reach import ArmDragged, ArmsReleased, Reach
 from workbench.live.commands import PlayRun
 from workbench.live.effects import Asked, Later, Then
-from workbench.live.events import Send, SettingsChanged, VersionLoaded
-from workbench.live.messages import EpisodeEnd, MoveBody, PullBody, Reached, SetSliderAction
+from workbench.live.events import PagesCounted, Send, SettingsChanged, VersionLoaded, WorkerDied
+from workbench.live.messages import (
+    EpisodeEnd,
+    MoveBody,
+    MoveJoints,
+    PullBody,
+    Reached,
+    SetSliderAction,
+    TaskFailed,
+)
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
 from workbench.task.description import Stepped
 
-DOES: frozenset[type[Command]] = frozenset({ToggleDriving, ToggleReach})
+DOES: frozenset[type[Command]] = frozenset(
+    {ToggleDriving, ToggleReach, ChooseMovedEnvs, DragJoint, SetJoint, UseKeyframe}
+)
 """Commands that `apply` handles."""
 LET_GO_SECONDS = 0.3
 """Time after the last report of held keys after which they count as released: the page reports three times in it,
@@ -60,6 +79,19 @@ class DrivingDue:
 
 
 @dataclass(frozen=True)
+class DraggedJoint:
+    """A joint whose slider is dragged while the envs stand still."""
+
+    robot: str
+    """As in `Robot.name`."""
+    env_idx: tuple[int, ...]
+    joint: int
+    """Place in `Robot.joints`."""
+    position: float
+    """In radians or metres."""
+
+
+@dataclass(frozen=True)
 class Hands:
     """Who drives: a person by keys, or another source of actions. Also the view of this feature."""
 
@@ -77,6 +109,10 @@ class Hands:
     """Whether the gripper closes."""
     reach: Reach = Reach()
     """Arms that are led by their handles."""
+    all_envs: bool = False
+    """Whether a move applies to all envs; if False, to the selected one."""
+    dragged: DraggedJoint | None = None
+    """A joint that the page shows elsewhere than in the env, during a drag and until the env has followed."""
 
 
 HandEvent = BodyMoved | BodyPulled | Driven | DrivingDue | ArmDragged | ArmsReleased | Reached
@@ -87,7 +123,7 @@ def apply(hands: Hands, event: object, run: Run) -> Change:
     """The next state after an event, and the effects to perform.
 
     Raises:
-        Refused: the body cannot be moved or pulled, or the robot cannot be driven now; nothing has changed.
+        Refused: the body or the joints cannot be moved, or the robot cannot be driven now; nothing has changed.
     """
     match event:
         case Asked(command=ToggleDriving()):
@@ -95,6 +131,16 @@ def apply(hands: Hands, event: object, run: Run) -> Change:
         case Asked(command=ToggleReach()):
             reach, requests = of_reach.toggle(hands.reach, run)
             return replace(hands, reach=reach), requests
+        case Asked(command=ChooseMovedEnvs(all_envs=all_envs)):
+            return replace(hands, all_envs=all_envs), []
+        case Asked(command=DragJoint(robot=robot, joint=joint, to=to)):
+            return _set_joint(hands, run, robot, joint, to, ends=False)
+        case Asked(command=SetJoint(robot=robot, joint=joint, to=to)):
+            return _set_joint(hands, run, robot, joint, to, ends=True)
+        case Asked(command=UseKeyframe(robot=robot, name=name)):
+            return hands, [_use_keyframe(hands, run, robot, name)]
+        case Stepped() | TaskFailed() | VersionLoaded() | PagesCounted() | WorkerDied() if hands.dragged:
+            return apply(replace(hands, dragged=None), event, run)
         case Driven(keys=keys, yaw=yaw, sticks=sticks) if hands.driving:
             return _drive(replace(hands, number=hands.number + 1), run, keys, yaw, sticks)
         case DrivingDue(number=hands.number) if hands.driving and (hands.keys or hands.sticks):
@@ -135,8 +181,15 @@ def _start(hands: Hands, run: Run) -> Change:
 def _take_over(hands: Hands, run: Run) -> Change:
     """The sliders become the source of actions, and hold the robots still until a person moves one."""
     settings = run.settings
-    started = replace(hands, driving=True, source=settings.action_source, episode_end=settings.episode_end)
-    started = replace(started, keys=(), sticks=(), closes=False)
+    started = replace(
+        hands,
+        driving=True,
+        source=settings.action_source,
+        episode_end=settings.episode_end,
+        keys=(),
+        sticks=(),
+        closes=False,
+    )
     # An episode that ends by itself would take the robot out of the hand.
     changed = SettingsChanged({"action_source": "sliders", "episode_end": "continue"})
     hold = Send(SetSliderAction(tuple(range(run.num_envs)), (), ()))
@@ -195,8 +248,7 @@ def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:
                 raise Refused("Pause first: a body is moved while the envs stand still.")
             if why := why_not_moved(_kind_of(run, body)):
                 raise Refused(why)
-            assert run.past is not None, "there is a live moment"
-            return [Send(MoveBody(body, env_idx, pose, run.past.history.last))]
+            return [Send(MoveBody(body, env_idx, pose, _newest(run)))]
         case BodyPulled(pull=PullBody(body="")):
             return [Send(event.pull)]
         case BodyPulled(pull=pull):
@@ -206,6 +258,51 @@ def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:
             if why := why_not_pulled(_kind_of(run, pull.body), on_gpu):
                 raise Refused(why)
             return [Send(pull)]
+
+
+def _set_joint(hands: Hands, run: Run, name: str, number: int, to: float, ends: bool) -> Change:
+    """A slider of a joint is dragged, or set if `ends`; `to` is in the unit of the page."""
+    robot = _robot_of(run, name)
+    if number >= len(robot.joints):
+        raise Refused(f"{name} has only {len(robot.joints)} joints.")
+    joint, envs = robot.joints[number], _envs_of_move(hands, run)
+    position = position_of(joint, to)
+    if run.playing:
+        return hands, _drive_joint(run, joint, envs, position)
+    hands = replace(hands, dragged=DraggedJoint(name, envs, number, position))
+    if not ends:
+        return hands, []
+    how = f"{joint.name} of {name} was set by hand."
+    return hands, [Send(MoveJoints(name, envs, (number,), (position,), None, how, _newest(run)))]
+
+
+def _drive_joint(run: Run, joint: Joint, envs: tuple[int, ...], position: float) -> list[Any]:
+    """Give a joint a position target through the action; takes over from another source of actions."""
+    assert run.task is not None, "`_robot_of` was called"
+    if joint.target is None:
+        raise Refused(why_not_driven(run.task.control_mode, joint.name))
+    dimension = run.task.actions[joint.target.dimension]
+    value = joint.target.scale * (position - joint.target.zero)
+    value = min(max(value, dimension.low), dimension.high)
+    told = Send(SetSliderAction(envs, (joint.target.dimension,), (value,)))
+    takes_over = Then(SettingsChanged({"action_source": "sliders"}))
+    return [told] if run.settings.action_source == "sliders" else [takes_over, told]
+
+
+def _use_keyframe(hands: Hands, run: Run, name: str, keyframe: str) -> Send:
+    robot = _robot_of(run, name)
+    found = next((one for one in robot.keyframes if one.name == keyframe), None)
+    if found is None:
+        raise Refused(f"{name} has no keyframe {keyframe}.")
+    if run.playing:
+        raise Refused("Pause first: a keyframe is set while the envs stand still.")
+    every, how = tuple(range(len(robot.joints))), f"{name} was put into its keyframe {keyframe} by hand."
+    return Send(MoveJoints(name, _envs_of_move(hands, run), every, found.qpos, found.root, how, _newest(run)))
+
+
+def why_not_driven(control_mode: str | None, joint: str) -> str:
+    """Why a joint cannot be driven while the envs play."""
+    return f"{control_mode or 'The control mode'} takes no position of {joint}: pause to set it."
 
 
 def why_not_moved(kind: str) -> str:
@@ -231,6 +328,26 @@ def _require_live(run: Run) -> None:
         raise Refused("There is nothing to move until the task has loaded.")
     if run.past.pinned is not None:
         raise Refused("This is a past moment. Press End to go live, or Shift+G to continue from here.")
+
+
+def _envs_of_move(hands: Hands, run: Run) -> tuple[int, ...]:
+    return tuple(range(run.num_envs)) if hands.all_envs else (run.env,)
+
+
+def _newest(run: Run) -> int:
+    """The serial of the newest moment."""
+    assert run.past is not None, "`_require_live` was called"
+    return run.past.history.last
+
+
+def _robot_of(run: Run, name: str) -> Robot:
+    """Raises `Refused` if there is no such robot, or nothing can be moved now."""
+    _require_live(run)
+    assert run.task is not None, "there is a live moment"
+    robot = next((one for one in run.task.robots if one.name == name), None)
+    if robot is None:
+        raise Refused("The task has no such robot.")
+    return robot
 
 
 def _kind_of(run: Run, body: str) -> str:

@@ -1,8 +1,8 @@
-"""Moves and pulls bodies in the worker's env."""
+"""Moves and pulls bodies, and sets joints, in the worker's env."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,15 +11,18 @@ import numpy as np
 import sapien
 import sapien.physx as physx
 import torch
+from mani_skill.utils.structs.pose import Pose
 from numpy.typing import NDArray
 
 from workbench.envs import maniskill_private
+from workbench.envs.read_robots import named_agents
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.simulation.cpu_system import batched_system
 from workbench.envs.snapshots.snapshot import begin_anew
 from workbench.envs.step_result import StepResult
 from workbench.envs.task_env import TaskEnv
-from workbench.live.messages import MoveBody, PullBody
+from workbench.episodes.recorded_state import settle_robot
+from workbench.live.messages import MoveBody, MoveJoints, PullBody
 from workbench.task.description import Pulled, Restored
 
 STIFFNESS = 400.0
@@ -51,6 +54,56 @@ def move_body(task: TaskEnv, request: MoveBody) -> tuple[StepResult, Restored] |
     moved = tuple(envs)
     how = f"{request.body} was moved by hand."
     return task.rescore(), Restored(moved, moved, request.origin, None, {}, how=how, moved=request.body)
+
+
+def move_joints(task: TaskEnv, request: MoveJoints) -> tuple[StepResult, Restored] | None:
+    """Put joints of a robot at positions, at rest; None if the env has no such robot or joint."""
+    env = task.env
+    agent = named_agents(env).get(request.robot)
+    envs = sorted(i for i in set(request.env_idx) if i < env.num_envs)
+    if agent is None or not envs or max(request.joints, default=0) >= len(agent.robot.active_joints):
+        return None
+    qpos = agent.robot.get_qpos()[envs].clone()
+    qpos[:, list(request.joints)] = torch.tensor(request.positions, device=qpos.device, dtype=qpos.dtype)
+    step = put_joints(task, agent, envs, qpos, request.root)
+    moved = tuple(envs)
+    return step, Restored(moved, moved, request.origin, None, {}, how=request.how, moved=request.robot)
+
+
+def put_joints(
+    task: TaskEnv,
+    agent: Any,
+    envs: list[int],
+    qpos: torch.Tensor,
+    root_pose: Sequence[float] | None = None,
+) -> StepResult:
+    """Put all joints of an agent's robot at positions in these envs, at rest.
+
+    Drive targets and controllers of the robot are set to the new positions, so that it stays there. The envs get new
+    physics scenes, as in `move_body`.
+
+    Args:
+        envs: in ascending order.
+        qpos: (len(envs), J) in rad or m.
+        root_pose: (7,) new pose of the robot's root; None leaves it.
+    """
+    env, robot = task.env, agent.robot
+    with maniskill_private.setting_only(env, envs):
+        if root_pose is not None:
+            root = torch.tensor(root_pose, device=qpos.device, dtype=qpos.dtype)
+            root[3:] /= root[3:].norm()
+            robot.set_root_pose(Pose.create(root.expand(len(envs), 7)))
+            still = torch.zeros((len(envs), 3), device=qpos.device)
+            robot.set_root_linear_velocity(still)
+            robot.set_root_angular_velocity(still)
+        robot.set_qpos(qpos)
+        robot.set_qvel(torch.zeros_like(qpos))
+        robot.set_qf(torch.zeros_like(qpos))
+    maniskill_private.apply_and_fetch(env)
+    settle_robot(env, envs, agent)
+    if batched_system(env.scene) is not None:
+        begin_anew(env, envs)
+    return task.rescore()
 
 
 def _actor(env: Any, name: str) -> Any:

@@ -236,6 +236,26 @@ class MoveBody:
 
 
 @dataclass(frozen=True)
+class MoveJoints:
+    """Put joints of a robot at positions, at rest; followed by a `Stepped` that has `Stepped.restored`. Drive targets and
+    controllers are set to the new positions. Dropped if the task has no such robot or joint."""
+
+    robot: str
+    """As in `Robot.name`."""
+    env_idx: tuple[int, ...]
+    joints: tuple[int, ...]
+    """Places in `Robot.joints`; the other joints keep their positions."""
+    positions: tuple[float, ...]
+    """One for each of `joints`, in radians or metres."""
+    root: tuple[float, ...] | None
+    """(7,) position and quaternion wxyz of the root in the frame of each env; None leaves the root where it is."""
+    how: str
+    """What the person did, as a sentence."""
+    origin: int
+    """The server's number of the newest moment; returned unchanged."""
+
+
+@dataclass(frozen=True)
 class PullBody:
     """Pull a body with a spring in every control step until the next `PullBody`; without a body, let go."""
 
@@ -327,6 +347,7 @@ Request = (
     | Restore
     | EnterRecording
     | MoveBody
+    | MoveJoints
     | PullBody
     | ReachPose
     | DrawPast

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, Picture, PictureDegree
 from workbench.envs.gpu_rules import Degree, Finding
 from workbench.envs.keywords import HowMade
+from workbench.envs.robots import Robot
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 from workbench.pictures.camera_report import ObjectToSee
@@ -147,6 +148,8 @@ class TaskDescription:
     """Objects for which a camera report can state how well a camera sees them."""
     joints: tuple[str, ...] = ()
     """Names of the joints whose positions are in `StepResult.qpos`."""
+    robots: tuple[Robot, ...] = ()
+    """The robots whose joints a person can set."""
     notices: tuple[str, ...] = ()
     """Notices about a working task, as sentences."""
     arms: tuple[ArmDescription, ...] = ()
@@ -193,7 +196,7 @@ class Restored:
     """Indices of the envs that were replayed up to the state. A restored state is an exact point: from it,
     the same actions give the same bits. A replayed state is not."""
     moved: str = ""
-    """Name of the body that a `MoveBody` moved; empty for other requests."""
+    """Name of the body or robot that a `MoveBody` or `MoveJoints` moved; empty for other requests."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from workbench.envs.error_notes import CoreRefusal
 from workbench.envs.gpu_rules import Degree, Finding
 from workbench.envs.keywords import constructor_arguments, control_mode_of, describe_keywords
 from workbench.envs.maniskill_private import parse_cameras, version_notice
+from workbench.envs.read_robots import read_robots
 from workbench.envs.recorded_run import env_kwargs
 from workbench.envs.scene.read_scene import read_geometry
 from workbench.envs.scene.scene_index import joint_names
@@ -326,6 +327,7 @@ def describe(
         joints=joint_names(env),
         arms=tuple(ArmDescription(arm.name, arm.joint_names) for arm in find_arms(env)),
         armless=without_arms(env),
+        robots=read_robots(env),
         parse_cameras=parse_cameras.__name__,
         made=describe_keywords(loaded.cls, env, given, loaded.default_kwargs, BaseEnv),
     )

@@ -27,7 +27,7 @@ from workbench.envs.step_result import StepResult
 from workbench.envs.task_drawings import drawings
 from workbench.envs.task_env import TaskEnv
 from workbench.hands.reach_worker import LedArms, set_arm
-from workbench.hands.worker import Hand, move_body
+from workbench.hands.worker import Hand, move_body, move_joints
 from workbench.live.messages import (
     SCENE_KEPT,
     Answer,
@@ -42,6 +42,7 @@ from workbench.live.messages import (
     Loaded,
     Loading,
     MoveBody,
+    MoveJoints,
     PlaceCamera,
     Play,
     Progress,
@@ -153,6 +154,7 @@ class Worker:
             Restore: lambda request: self._task.guarded(partial(self._go, request)),
             EnterRecording: lambda request: self._task.guarded(partial(self._go, request)),
             MoveBody: lambda request: self._task.guarded(partial(self._move, request)),
+            MoveJoints: lambda request: self._task.guarded(partial(self._move, request)),
             PullBody: self._hand.take,
             ReachPose: self._reach,
             DrawPast: self._cameras.draw_past,
@@ -587,12 +589,17 @@ class Worker:
         self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
-    def _move(self, request: MoveBody, opened: OpenedTask) -> None:
+    def _move(self, request: MoveBody | MoveJoints, opened: OpenedTask) -> None:
         self._cameras.settle()  # the envs get new physics scenes
         with blamed("restore", opened.loaded, opened.env):
-            moved = move_body(opened.env, request)
+            if isinstance(request, MoveBody):
+                moved = move_body(opened.env, request)
+            else:
+                moved = move_joints(opened.env, request)
         if moved is not None:
             step, restored = moved
+            if isinstance(request, MoveJoints):
+                self._chooser.begin(restored.env_idx)  # the last targets would drive the joints back
             self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
 
     def _reach(self, request: ReachPose) -> None:
@@ -721,6 +728,7 @@ _DOING: dict[type, Doing] = {
     EnterRecording: "resetting",
     MoveBody: "resetting",
     ReachPose: "resetting",
+    MoveJoints: "resetting",
     ReadPolicyAgain: "importing the policy",
     WarmUp: "warming up",
     ListTasks: "starting",

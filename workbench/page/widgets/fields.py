@@ -44,6 +44,7 @@ class Field:
         lines: int = 1,
         step: float = 1.0,
         options: Mapping[str, Plain] | None = None,
+        done: type[Command] | None = None,
     ) -> None:
         """
         Args:
@@ -55,6 +56,8 @@ class Field:
             lines: more than one for a larger box, in which Enter begins a new line.
             step: for a number: the change per press of an arrow key.
             options: for a choice: values of the field by their label.
+            done: for a slider: the command, with the same fields, for the value at the end of a drag and for a number
+                that is entered; by default `kind`.
         """
         self._names = [".".join([look, name_of(kind), field, *map(str, one.values())]) for one in given]
         self._options = None if options is None else _encoded(options)
@@ -77,6 +80,7 @@ class Field:
                 enter=enter,
                 longest=longest,
                 lines=lines,
+                done="" if done is None else name_of(done),
             )
         )
         self._shown = server.gui.add_html("")
@@ -193,16 +197,27 @@ def slider(
     step: float = 1.0,
     given: Mapping[str, Plain] | None = None,
     hint: str = "",
+    done: type[Command] | None = None,
 ) -> Field:
     """A slider with a number next to it. It shows its lower end until `Field.show` sets a value.
 
     Args:
         bounds: ends of the slider; by default the bounds of the command's field.
+        done: see `Field`.
     """
     low, high, _ = _number(kind, field, float) or (None, None, False)
     ends = bounds or (low or 0.0, high or 0.0)
     made = Field(
-        server, label, kind, field, ends[0], look="slider", given=(given or {},), hint=hint, step=step
+        server,
+        label,
+        kind,
+        field,
+        ends[0],
+        look="slider",
+        given=(given or {},),
+        hint=hint,
+        step=step,
+        done=done,
     )
     made.show(ends[0], bounds=ends)
     return made

@@ -1,0 +1,71 @@
+"""Units and limits of a robot's joints, and a robot's state as source text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.robots import Joint
+
+Floats = NDArray[np.floating[Any]]
+FREE_DEGREES, FREE_METRES = 180.0, 2.0
+"""Half the range of a slider of a joint without limits, around 0."""
+
+
+def unit_of(joint: Joint) -> str:
+    return "m" if joint.prismatic else "°"
+
+
+def shown(joint: Joint, position: float) -> float:
+    """A position in the unit of the page: degrees or metres, rounded."""
+    return round(position, 4) if joint.prismatic else round(math.degrees(position), 2)
+
+
+def position_of(joint: Joint, value: float) -> float:
+    """The position for a value in the unit of the page, within the joint's limits."""
+    return min(max(value if joint.prismatic else math.radians(value), joint.low), joint.high)
+
+
+def slider_bounds(joint: Joint, position: float) -> tuple[float, float]:
+    """Ends of the joint's slider in the unit of the page: its limits; without limits, a range that contains its position."""
+    free, value = FREE_METRES if joint.prismatic else FREE_DEGREES, shown(joint, position)
+    low = shown(joint, joint.low) if math.isfinite(joint.low) else min(-free, value)
+    high = shown(joint, joint.high) if math.isfinite(joint.high) else max(free, value)
+    return low, max(high, low)
+
+
+def limits_text(joint: Joint) -> str:
+    """Kind and limits of a joint."""
+    kind, unit = ("prismatic", " m") if joint.prismatic else ("revolute", "°")
+    if math.isinf(joint.low) and math.isinf(joint.high):
+        return f"{kind}, no limits"
+    low, high = (f"{shown(joint, end):g}" for end in (joint.low, joint.high))
+    return f"{kind}, {low} to {high}{unit}"
+
+
+def qpos_code(qpos: Sequence[float] | Floats) -> str:
+    """The joint positions as an assignment."""
+    return f"qpos = {_array_code(qpos)}"
+
+
+def keyframe_code(qpos: Sequence[float] | Floats, root: Sequence[float] | Floats) -> str:
+    """An entry of an agent's ``keyframes``.
+
+    Args:
+        root: (7,) position and quaternion wxyz of the robot's root.
+    """
+    p, q = (f"[{', '.join(map(_number, part))}]" for part in (root[:3], root[3:]))
+    return f'"new": Keyframe(\n    qpos={_array_code(qpos)},\n    pose=sapien.Pose(p={p}, q={q}),\n),'
+
+
+def _array_code(values: Sequence[float] | Floats) -> str:
+    return f"np.array([{', '.join(map(_number, values))}])"
+
+
+def _number(value: float) -> str:
+    """The shortest text that reads back as this float32."""
+    return np.format_float_positional(np.float32(value) + np.float32(0), unique=True, trim="0")

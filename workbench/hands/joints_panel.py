@@ -1,0 +1,212 @@
+"""The fold *Joints* of the Run tab: a slider for each joint, and the keyframes of each robot."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import ClassVar
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.envs.robots import Joint, Robot
+from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe
+from workbench.hands.joints import (
+    keyframe_code,
+    limits_text,
+    qpos_code,
+    shown,
+    slider_bounds,
+    unit_of,
+)
+from workbench.hands.link_poses import link_poses
+from workbench.hands.panel import scope_choice
+from workbench.hands.state import Hands
+from workbench.live.panels.run_panel import control_modes
+from workbench.live.view import SessionView
+from workbench.page.commands import TellUnfolded
+from workbench.page.widgets.fields import Field, slider
+from workbench.page.widgets.parts import PagePart, name_fold
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import Label, Tool, tools_html
+
+TITLE = "Joints"
+POSITION_MODE = "pd_joint_pos"
+"""The control mode of absolute joint positions that ManiSkill's agents have."""
+NUMBER_STEPS = {"°": 1.0, "m": 0.001}
+"""Change of a number for each press of an arrow key."""
+PAST = "This is a past moment. Press End to go live."
+SETS = "A slider puts its joint there, at rest. Shift+U undoes it."
+DRIVES = "A slider drives its joint; it takes over from the source of actions."
+
+
+class JointsPanel(PagePart[SessionView]):
+    """The fold *Joints*.
+
+    While a slider is dragged and nothing plays, only the page shows the joint at its new position (`with_dragged_joint`);
+    the env gets the position when the drag ends. So a drag is one event of the history.
+
+    Args:
+        order: viser's order of the fold in its tab.
+    """
+
+    every: ClassVar[float] = 0.1
+
+    def __init__(self, server: viser.ViserServer, order: float) -> None:
+        self._server = server
+        self._robots: tuple[Robot, ...] = ()
+        self._unfolded = False
+        """Whether some page has unfolded it: until then its content is neither made nor sent."""
+        self._parts: list[_RobotPart] = []
+        self._fold = server.gui.add_folder(TITLE, order=order, expand_by_default=False, visible=False)
+        with self._fold:
+            server.gui.add_html(render("tell", command=TellUnfolded(panel=TITLE)))
+            self._note = server.gui.add_html("")
+            self._scope = scope_choice(server)
+
+    def unfold(self) -> None:
+        """Handle a page's report: a person has unfolded it."""
+        self._unfolded = True
+
+    def key(self, view: SessionView) -> object:
+        shown = view.step_serial, view.task_serial, view.selected_env, view.timeline.shown, view.playing
+        return shown, view.settings.action_source, id(view.told), view.of(Hands), self._unfolded
+
+    def urgent(self, view: SessionView) -> object:
+        return view.of(Hands).dragged, self._unfolded, view.playing
+
+    def draw(self, view: SessionView) -> None:
+        robots = () if view.task is None or _qpos(view) is None else view.task.robots
+        self._fold.visible = bool(robots)
+        if not robots:
+            return
+        name_fold(self._fold, TITLE, robots[0].name if len(robots) == 1 else f"{len(robots)} robots")
+        if not self._unfolded:
+            return
+        if robots != self._robots:
+            for part in self._parts:
+                part.remove()
+            with self._fold:
+                self._parts = [_RobotPart(self._server, robot, alone=len(robots) == 1) for robot in robots]
+            self._robots = robots
+        self._note.content = render("note", text=note_of(view))
+        self._scope.visible = view.task is not None and view.task.num_envs > 1
+        self._scope.show(view.of(Hands).all_envs)
+        for part in self._parts:
+            part.draw(view)
+
+
+class _RobotPart:
+    """The keyframes and sliders of one robot."""
+
+    def __init__(self, server: viser.ViserServer, robot: Robot, alone: bool) -> None:
+        self._robot, self._alone = robot, alone
+        self._head = server.gui.add_html("")
+        self._sliders: list[Field] = []
+        for number, (joint, name) in enumerate(zip(robot.joints, short_names(robot.joints), strict=True)):
+            unit = unit_of(joint)
+            self._sliders.append(
+                slider(
+                    server,
+                    f"{name} {unit}",
+                    DragJoint,
+                    "to",
+                    slider_bounds(joint, 0.0),
+                    step=NUMBER_STEPS[unit],
+                    given={"robot": robot.name, "joint": number},
+                    hint=f"{joint.name}: {limits_text(joint)}",
+                    done=SetJoint,
+                )
+            )
+
+    def draw(self, view: SessionView) -> None:
+        robot, qpos = self._robot, _qpos(view)
+        assert view.task is not None and view.step is not None and qpos is not None, "the fold is visible"
+        env, past = min(view.selected_env, len(qpos) - 1), view.timeline.shown is not None
+        for number, (joint, field) in enumerate(zip(robot.joints, self._sliders, strict=True)):
+            position = shown_position(view, robot, number)
+            off = past or (view.playing and joint.target is None)
+            field.show(shown(joint, position), off=off, bounds=slider_bounds(joint, position))
+        keyframes = [
+            Tool(one.name, UseKeyframe(robot=robot.name, name=one.name), off=past or view.playing)
+            for one in robot.keyframes
+        ]
+        label = Label("Keyframe", f"{UseKeyframe.help()}.")
+        now, root = qpos[env, [joint.column for joint in robot.joints]], robot.links[0].body
+        self._head.content = render(
+            "joints",
+            name="" if self._alone else robot.name,
+            keyframes=tools_html([label, *keyframes]) if keyframes else "",
+            qpos=qpos_code(now),
+            keyframe=keyframe_code(now, view.step.poses[env, root]),
+        )
+
+    def remove(self) -> None:
+        self._head.remove()
+        for one in self._sliders:
+            one.remove()
+
+
+def note_of(view: SessionView) -> str:
+    """What a slider does now; if it is disabled, why, and what to choose."""
+    if view.timeline.shown is not None:
+        return PAST
+    if view.task is None or not view.playing:
+        return SETS
+    off = [joint.name for robot in view.task.robots for joint in robot.joints if joint.target is None]
+    count = sum(len(robot.joints) for robot in view.task.robots)
+    mode = view.task.control_mode or "The control mode"
+    advice = "Pause to set them"
+    if POSITION_MODE in control_modes(view) and mode != POSITION_MODE:
+        advice += f", or choose {POSITION_MODE} under Control"
+    if len(off) == count:
+        return f"{mode} takes no joint positions. {advice}."
+    return f"{DRIVES} {mode} takes no position of {', '.join(off)}. {advice}." if off else DRIVES
+
+
+def short_names(joints: Iterable[Joint]) -> list[str]:
+    """The joints' names without the words with which all of them begin."""
+    names = [joint.name for joint in joints]
+    prefix = os.path.commonprefix(names)
+    start = prefix.rfind("_") + 1
+    return [name[start:] for name in names]
+
+
+def shown_position(view: SessionView, robot: Robot, number: int) -> float:
+    """Position of a joint that its slider shows: where it is dragged or driven to, or where it is, in radians or metres."""
+    qpos, joint, dragged = _qpos(view), robot.joints[number], view.of(Hands).dragged
+    assert qpos is not None, "the fold is visible"
+    env, target = min(view.selected_env, len(qpos) - 1), joint.target
+    if dragged is not None and (dragged.robot, dragged.joint) == (robot.name, number):
+        if env in dragged.env_idx:
+            return dragged.position
+    is_driven = view.playing and view.settings.action_source == "sliders"
+    if is_driven and target is not None and view.told is not None and env < len(view.told):
+        return float(view.told[env, target.dimension]) / target.scale + target.zero
+    return float(qpos[env, joint.column])
+
+
+def with_dragged_joint(view: SessionView, poses: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`poses` (N, B, 7) with the links of a robot where a dragged slider puts them."""
+    dragged, qpos = view.of(Hands).dragged, _qpos(view)
+    if dragged is None or qpos is None or view.task is None or view.timeline.shown is not None:
+        return poses
+    robot = next((one for one in view.task.robots if one.name == dragged.robot), None)
+    if robot is None or len(qpos) != len(poses):
+        return poses
+    envs = list(dragged.env_idx)
+    positions = qpos[np.ix_(envs, [joint.column for joint in robot.joints])].astype(np.float64)
+    positions[:, dragged.joint] = dragged.position
+    moved = poses.copy()
+    moved[envs] = link_poses(robot, poses[envs], positions)
+    return moved
+
+
+def _qpos(view: SessionView) -> NDArray[np.float32] | None:
+    """(N, J) of the shown step; None if it is not that of the task."""
+    if view.task is None or view.step is None or view.step.qpos is None:
+        return None
+    columns = max((joint.column for robot in view.task.robots for joint in robot.joints), default=0)
+    qpos = view.step.qpos
+    return qpos if len(qpos) == view.task.num_envs and columns < qpos.shape[1] else None
