@@ -183,6 +183,19 @@ def test_a_long_list_is_shown_in_pages(rescoring: Rescoring) -> None:
     assert "1 to 10 of 23" in rescoring.panels.html(), "a new result begins at its first page"
 
 
+def test_a_file_that_becomes_known_is_a_choice_of_code(
+    panels: Panels, library: Library, review: Review, tmp_path: Path
+) -> None:
+    known: list[Path] = []
+    panel = RescorePanel(
+        panels.server, cast(Any, FakeJob()), review, library, RescoreChoices(AS_RECORDED), lambda: known
+    )
+    for labels in ([TODAYS, RECORDED], [TODAYS, RECORDED, "pull.py"]):
+        panel.draw(review.view())
+        assert list(panels.field("Code").options) == labels
+        known.append(tmp_path / "pull.py")
+
+
 def test_an_invalid_choice_sent_by_a_page_is_harmless(rescoring: Rescoring) -> None:
     rescoring.draw(RescoreView())
     assert rescoring.panels.field("Code").value == "as recorded"
