@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from mani_skill.utils.structs import Pose
 
 from tests.drive.envs import batched
 from workbench.envs.camera_data import CameraSettings
@@ -77,6 +79,15 @@ def test_a_cancelled_search_ends_at_once_with_its_results(env: Any) -> None:
 def test_a_placement_that_sees_nothing_is_not_suggested(env: Any) -> None:
     under_the_table = SearchSpace(("cube",), (0, 0, -0.5), (0, 0, -0.5), LENS, candidates=4)
     assert suggest_cameras(env, under_the_table, [0]) == ()
+
+
+def test_a_placement_whose_object_the_robot_hides_is_not_suggested(env: Any) -> None:
+    inside_the_base = torch.tensor([[-0.615, 0.0, 0.07, 1.0, 0.0, 0.0, 0.0]] * N)
+    env.obj.set_pose(Pose(inside_the_base))
+    try:
+        assert suggest_cameras(env, SearchSpace(("cube",), LOW, HIGH, LENS, candidates=4, best=1), [0]) == ()
+    finally:
+        env.reset(seed=3)
 
 
 def test_suggestions_for_a_mounted_camera_are_upright_and_in_the_links_frame(
