@@ -12,6 +12,7 @@
 //   data-hover='["hover_body", {"body": "cube"}]'  command while the pointer is on this element; then again with empty fields
 //   data-copy="text"                         a press copies this text
 //   data-tell='["tell_unfolded", {...}]'     command sent when the element is added (data-only="x": only if <html> has data-x)
+//   data-seen='["tell_unfolded", {...}]'     command sent when the element first comes into sight
 //   data-into-sight                          scroll the parent into view when added; data-follow="7": the library's row 7
 //   data-title="PushCube"                    title of the browser's tab; without one the last title stays
 //   data-field='["set_seed", {}, "seed"]'    command, its other fields, and the field for the value: committed on Enter or blur, when an
@@ -611,6 +612,13 @@
     },
     drive() {
       padBeat ||= setInterval(readPad, PAD_BEAT);
+    },
+    seen(element) {
+      new IntersectionObserver(([{ isIntersecting }], observer) => {
+        if (!isIntersecting) return;
+        observer.disconnect();
+        send(JSON.parse(element.dataset.seen));
+      }).observe(element);
     },
     autofocus(input) {
       input.focus();

@@ -24,7 +24,9 @@ from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Leaf
 from workbench.envs.keywords import HowMade, Keyword
-from workbench.hands.state import Hands
+from workbench.envs.robots import Joint, JointTarget, Robot, RobotKeyframe, RobotLink
+from workbench.hands.joints_panel import TITLE as JOINTS
+from workbench.hands.state import DraggedJoint, Hands
 from workbench.live.history.curves import Column
 from workbench.live.history.moments import RESET, SUCCESS, EpisodeNumbers
 from workbench.live.messages import ReloadReport, RulesBroken
@@ -36,7 +38,7 @@ from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import ProcessMemory
 from workbench.live.run import PastLoad
 from workbench.live.view import SessionView
-from workbench.page.commands import TellOpenTab, ToggleTable
+from workbench.page.commands import TellOpenTab, TellUnfolded, ToggleTable
 from workbench.planning.seeds_report import SolvedSeed, SolveReport
 from workbench.record.saving_state import SaveStatus
 from workbench.record.state import RecordingStatus
@@ -54,6 +56,13 @@ FOUND = Finding("reward-changes", "warn", "a message", "/home/me/push.py", 24, "
 MODES = (Keyword("control_mode", "choice", '"pd_joint_pos"', choices=('"pd_joint_pos"', '"pd_ee_pose"')),)
 LENS = CameraSettings((0.3, 0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
 CAMERA = replace(camera(), settings=LENS)
+_HERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+ARM = Robot(
+    "arm",
+    (Joint("hinge", False, -1.0, 1.0, 0, JointTarget(0, 1.0, 0.0)),),
+    (RobotLink(0, -1, -1, _HERE, _HERE), RobotLink(2, 0, 0, _HERE, _HERE)),
+    (RobotKeyframe("rest", (0.0,), None),),
+)
 KEY = CAMERA.key
 PAST = TimelineView(0, 40, None, 0, 40, 40, 2**20, 2**28, 41)
 
@@ -82,14 +91,20 @@ def picture(grey: int, env: int = 0) -> dict[Any, Picture]:
 def base() -> SessionView:
     """A view in which every part has content; paused, so that each view is drawn."""
     view = running(ENVS, playing=False, state="paused", steps_per_second=0.0)
-    assert view.task is not None
+    assert view.task is not None and view.step is not None
     task = replace(
-        view.task, cameras=(CAMERA,), made=HowMade("panda", MODES), joints=("hinge",), notices=("note one",)
+        view.task,
+        cameras=(CAMERA,),
+        made=HowMade("panda", MODES),
+        joints=("hinge",),
+        robots=(ARM,),
+        notices=("note one",),
     )
     load = PastLoad(1e9, None, "the first version", 900.0)
     return changed(
         view,
         task=task,
+        step=replace(view.step, qpos=np.zeros((ENVS, 1), np.float32)),
         options=TaskOptions(ENVS),
         timeline=PAST,
         details=np.zeros((ENVS, 2), np.float32),
@@ -182,6 +197,10 @@ CHANGES: dict[str, Any] = {
     "what studio can undo": just(studio=studio(undo="moved base_camera")),
     "a moved mount": just(studio=studio(mount=np.array([0, 1, 0, 1, 0, 0, 0], np.float32))),
     "a person drives": just(hands=Hands(driving=True)),
+    "a joint": lambda view: other_step(view, qpos=np.full((ENVS, 1), 0.5, np.float32)),
+    "a dragged joint": just(hands=Hands(dragged=DraggedJoint("arm", (0,), 0, 0.7))),
+    "moves of all envs": just(hands=Hands(all_envs=True)),
+    "another keyframe": lambda view: other_task(view, robots=(replace(ARM, keyframes=(RobotKeyframe("up", (0.1,), None),)),)),
     "a condition to pause at": just(pause_when=PauseWhen("reward", "rises above", 0.5)),
     "a pause at a condition": just(pause_when=PauseWhen("success"), paused_at=30),
     "a picture": just(pictures=picture(200), pictures_serial=2),
@@ -205,6 +224,7 @@ def made() -> Live:
         "rescored_curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.do(ToggleTable())
+    live.do(TellUnfolded(panel=JOINTS))
     return live
 
 

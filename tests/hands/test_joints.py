@@ -308,13 +308,13 @@ def test_a_slider_shows_degrees_or_metres_and_stays_within_the_limits() -> None:
         position_of(hinge, 45.0) == pytest.approx(math.pi / 4) and position_of(hinge, -200.0) == -math.pi / 2
     )
     assert position_of(rail, 1.0) == 0.04 and shown(rail, 0.0123456) == 0.0123
-    assert limits_text(hinge) == "revolute, -90 to 180°" and limits_text(rail) == "prismatic, 0 to 0.04 m"
+    assert limits_text(hinge) == "-90 to 180°" and limits_text(rail) == "0 to 0.04 m"
     wheel = Joint("wheel", False, -math.inf, math.inf, 0)
     assert slider_bounds(wheel, 0.0) == (-180.0, 180.0) and slider_bounds(wheel, 4 * math.pi) == (
         -180.0,
         720.0,
     )
-    assert limits_text(wheel) == "revolute, no limits"
+    assert limits_text(wheel) == "no limits, °"
 
 
 def test_the_copied_text_reads_back_as_the_same_numbers(tmp_path: Path) -> None:

@@ -16,10 +16,6 @@ FREE_DEGREES, FREE_METRES = 180.0, 2.0
 """Half the range of a slider of a joint without limits, around 0."""
 
 
-def unit_of(joint: Joint) -> str:
-    return "m" if joint.prismatic else "°"
-
-
 def shown(joint: Joint, position: float) -> float:
     """A position in the unit of the page: degrees or metres, rounded."""
     return round(position, 4) if joint.prismatic else round(math.degrees(position), 2)
@@ -39,12 +35,12 @@ def slider_bounds(joint: Joint, position: float) -> tuple[float, float]:
 
 
 def limits_text(joint: Joint) -> str:
-    """Kind and limits of a joint."""
-    kind, unit = ("prismatic", " m") if joint.prismatic else ("revolute", "°")
-    if math.isinf(joint.low) and math.isinf(joint.high):
-        return f"{kind}, no limits"
-    low, high = (f"{shown(joint, end):g}" for end in (joint.low, joint.high))
-    return f"{kind}, {low} to {high}{unit}"
+    """The joint's limits with their unit."""
+    low, high = (shown(joint, end) for end in (joint.low, joint.high))
+    unit = " m" if joint.prismatic else "°"
+    if math.isinf(low) and math.isinf(high):
+        return f"no limits, {unit.strip()}"
+    return f"{low:g} to {high:g}{unit}"
 
 
 def qpos_code(qpos: Sequence[float] | Floats) -> str:
@@ -58,7 +54,10 @@ def keyframe_code(qpos: Sequence[float] | Floats, root: Sequence[float] | Floats
     Args:
         root: (7,) position and quaternion wxyz of the robot's root.
     """
-    p, q = (f"[{', '.join(map(_number, part))}]" for part in (root[:3], root[3:]))
+    # Six decimals: a micrometre.
+    p, q = (
+        f"[{', '.join(_number(round(float(value), 6)) for value in part)}]" for part in (root[:3], root[3:])
+    )
     return f'"new": Keyframe(\n    qpos={_array_code(qpos)},\n    pose=sapien.Pose(p={p}, q={q}),\n),'
 
 

@@ -18,7 +18,6 @@ from workbench.hands.joints import (
     qpos_code,
     shown,
     slider_bounds,
-    unit_of,
 )
 from workbench.hands.link_poses import link_poses
 from workbench.hands.panel import scope_choice
@@ -34,11 +33,9 @@ from workbench.page.widgets.tools import Label, Tool, tools_html
 TITLE = "Joints"
 POSITION_MODE = "pd_joint_pos"
 """The control mode of absolute joint positions that ManiSkill's agents have."""
-NUMBER_STEPS = {"°": 1.0, "m": 0.001}
-"""Change of a number for each press of an arrow key."""
 PAST = "This is a past moment. Press End to go live."
 SETS = "A slider puts its joint there, at rest. Shift+U undoes it."
-DRIVES = "A slider drives its joint; it takes over from the source of actions."
+DRIVES = "A slider drives its joint; the source of actions becomes sliders."
 
 
 class JointsPanel(PagePart[SessionView]):
@@ -61,7 +58,7 @@ class JointsPanel(PagePart[SessionView]):
         self._parts: list[_RobotPart] = []
         self._fold = server.gui.add_folder(TITLE, order=order, expand_by_default=False, visible=False)
         with self._fold:
-            server.gui.add_html(render("tell", command=TellUnfolded(panel=TITLE)))
+            server.gui.add_html(render("tell_seen", command=TellUnfolded(panel=TITLE)))
             self._note = server.gui.add_html("")
             self._scope = scope_choice(server)
 
@@ -74,7 +71,7 @@ class JointsPanel(PagePart[SessionView]):
         return shown, view.settings.action_source, id(view.told), view.of(Hands), self._unfolded
 
     def urgent(self, view: SessionView) -> object:
-        return view.of(Hands).dragged, self._unfolded, view.playing
+        return view.of(Hands).dragged, view.task_serial, view.playing, self._unfolded
 
     def draw(self, view: SessionView) -> None:
         robots = () if view.task is None or _qpos(view) is None else view.task.robots
@@ -105,18 +102,18 @@ class _RobotPart:
         self._head = server.gui.add_html("")
         self._sliders: list[Field] = []
         for number, (joint, name) in enumerate(zip(robot.joints, short_names(robot.joints), strict=True)):
-            unit = unit_of(joint)
             self._sliders.append(
                 slider(
                     server,
-                    f"{name} {unit}",
+                    name,
                     DragJoint,
                     "to",
                     slider_bounds(joint, 0.0),
-                    step=NUMBER_STEPS[unit],
+                    step=0.001 if joint.prismatic else 1.0,
                     given={"robot": robot.name, "joint": number},
-                    hint=f"{joint.name}: {limits_text(joint)}",
+                    hint=f"{joint.name}, {'prismatic' if joint.prismatic else 'revolute'}",
                     done=SetJoint,
+                    note=limits_text(joint),
                 )
             )
 
@@ -134,13 +131,13 @@ class _RobotPart:
         ]
         label = Label("Keyframe", f"{UseKeyframe.help()}.")
         now, root = qpos[env, [joint.column for joint in robot.joints]], robot.links[0].body
-        self._head.content = render(
+        copies = render(
             "joints",
             name="" if self._alone else robot.name,
-            keyframes=tools_html([label, *keyframes]) if keyframes else "",
             qpos=qpos_code(now),
             keyframe=keyframe_code(now, view.step.poses[env, root]),
         )
+        self._head.content = copies + (tools_html([label, *keyframes]) if keyframes else "")
 
     def remove(self) -> None:
         self._head.remove()
@@ -154,15 +151,16 @@ def note_of(view: SessionView) -> str:
         return PAST
     if view.task is None or not view.playing:
         return SETS
-    off = [joint.name for robot in view.task.robots for joint in robot.joints if joint.target is None]
-    count = sum(len(robot.joints) for robot in view.task.robots)
+    joints = [joint for robot in view.task.robots for joint in robot.joints]
+    driven = sum(joint.target is not None for joint in joints)
+    if driven == len(joints):
+        return DRIVES
     mode = view.task.control_mode or "The control mode"
     advice = "Pause to set them"
     if POSITION_MODE in control_modes(view) and mode != POSITION_MODE:
         advice += f", or choose {POSITION_MODE} under Control"
-    if len(off) == count:
-        return f"{mode} takes no joint positions. {advice}."
-    return f"{DRIVES} {mode} takes no position of {', '.join(off)}. {advice}." if off else DRIVES
+    which = " for the disabled joints" if driven else ""
+    return f"{mode} takes no positions{which}. {advice}."
 
 
 def short_names(joints: Iterable[Joint]) -> list[str]:

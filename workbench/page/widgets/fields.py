@@ -45,6 +45,7 @@ class Field:
         step: float = 1.0,
         options: Mapping[str, Plain] | None = None,
         done: type[Command] | None = None,
+        note: str = "",
     ) -> None:
         """
         Args:
@@ -58,6 +59,7 @@ class Field:
             options: for a choice: values of the field by their label.
             done: for a slider: the command, with the same fields, for the value at the end of a drag and for a number
                 that is entered; by default `kind`.
+            note: small text under the label.
         """
         self._names = [".".join([look, name_of(kind), field, *map(str, one.values())]) for one in given]
         self._options = None if options is None else _encoded(options)
@@ -81,6 +83,7 @@ class Field:
                 longest=longest,
                 lines=lines,
                 done="" if done is None else name_of(done),
+                note=note,
             )
         )
         self._shown = server.gui.add_html("")
@@ -198,12 +201,13 @@ def slider(
     given: Mapping[str, Plain] | None = None,
     hint: str = "",
     done: type[Command] | None = None,
+    note: str = "",
 ) -> Field:
     """A slider with a number next to it. It shows its lower end until `Field.show` sets a value.
 
     Args:
         bounds: ends of the slider; by default the bounds of the command's field.
-        done: see `Field`.
+        done, note: see `Field`.
     """
     low, high, _ = _number(kind, field, float) or (None, None, False)
     ends = bounds or (low or 0.0, high or 0.0)
@@ -218,6 +222,7 @@ def slider(
         hint=hint,
         step=step,
         done=done,
+        note=note,
     )
     made.show(ends[0], bounds=ends)
     return made
