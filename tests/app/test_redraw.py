@@ -26,6 +26,7 @@ from workbench.envs.inspection import Inspection, Leaf
 from workbench.envs.keywords import HowMade, Keyword
 from workbench.envs.robots import Joint, JointTarget, Robot, RobotKeyframe, RobotLink
 from workbench.hands.joints_panel import TITLE as JOINTS
+from workbench.hands.reach import Reach
 from workbench.hands.state import DraggedJoint, Hands
 from workbench.live.history.curves import Column
 from workbench.live.history.moments import RESET, SUCCESS, EpisodeNumbers
@@ -201,6 +202,7 @@ CHANGES: dict[str, Any] = {
     "a dragged joint": just(hands=Hands(dragged=DraggedJoint("arm", (0,), 0, 0.7))),
     "moves of all envs": just(hands=Hands(all_envs=True)),
     "another keyframe": lambda view: other_task(view, robots=(replace(ARM, keyframes=(RobotKeyframe("up", (0.1,), None),)),)),
+    "handles at the end effectors": just(hands=Hands(reach=Reach(shown=True))),
     "a condition to pause at": just(pause_when=PauseWhen("reward", "rises above", 0.5)),
     "a pause at a condition": just(pause_when=PauseWhen("success"), paused_at=30),
     "a picture": just(pictures=picture(200), pictures_serial=2),

@@ -4,7 +4,9 @@
 
     move_ms     a paused cube is put elsewhere, until the view has it there
     force_ms    a spring pulls the cube while the envs play in real time, until it has moved by 0.1 mm
-    ik_ms       a key drives the end effector (pd_ee_delta_pose, inverse kinematics), until a joint has moved by 1e-4 rad
+    ik_ms       the handles of an end effector are dragged by 5 cm while the envs play (inverse kinematics), until a joint has
+                moved by 1e-4 rad
+    key_ms      a key drives the end effector (pd_ee_delta_pose), likewise
 
 ``--json`` prints one line.
 """
@@ -26,7 +28,8 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import TASK
 from workbench.app.session import Session
-from workbench.hands.commands import ToggleDriving
+from workbench.hands.commands import ToggleDriving, ToggleReach
+from workbench.hands.reach import ArmDragged
 from workbench.hands.state import BodyMoved, BodyPulled, Driven
 from workbench.live.commands import PauseRun, PlayRun, ResetAll
 from workbench.live.messages import PullBody
@@ -100,6 +103,21 @@ def driven(session: Session, k: int) -> float:
     return took
 
 
+def reached(session: Session, k: int) -> float:
+    start_over(session)
+    session.do(PlayRun())
+    wait(session, lambda view: view.playing and view.step is not None and view.step.elapsed_steps[ENV] >= 4)
+    view = session.view()
+    assert view.task is not None and view.step is not None
+    arm = view.task.arms[0].body
+    before = joints_in(view).copy()
+    x, y, z, *q = map(float, view.step.poses[ENV, view.task.geometry.body_names.index(arm)])
+    session.happen(ArmDragged(arm, ENV, (x, y, z + (0.05 if k % 2 else -0.05), *q)))
+    took = wait(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
+    session.do(ToggleDriving())
+    return took
+
+
 def main(options: Options) -> None:
     with tempfile.TemporaryDirectory() as folder:
         made = TaskOptions(num_envs=options.num_envs, env_kwargs={"control_mode": "pd_ee_delta_pose"})
@@ -110,9 +128,11 @@ def main(options: Options) -> None:
             start_over(session)
             took = {"move_ms": [moved(session, k) for k in range(options.times)]}
             took["force_ms"] = [pulled(session, k) for k in range(options.times)]
+            session.do(ToggleReach())
+            took["ik_ms"] = [reached(session, k) for k in range(options.times)]
             start_over(session)
             session.do(ToggleDriving())
-            took["ik_ms"] = [driven(session, k) for k in range(options.times)]
+            took["key_ms"] = [driven(session, k) for k in range(options.times)]
         finally:
             session.close()
     medians = {name: round(statistics.median(values), 1) for name, values in took.items()}

@@ -12,6 +12,7 @@ import asyncio
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -56,6 +57,7 @@ class Client:
 
     client_id: int = 1
     notices: list[str] = field(default_factory=list)
+    camera: Any = field(default_factory=lambda: SimpleNamespace(wxyz=(1.0, 0.0, 0.0, 0.0)))
 
     def add_notification(self, title: str, body: str, **_: object) -> None:
         self.notices.append(body)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 DEAD_ZONE = 0.12
 """Deflection of a stick or trigger below which it counts as released."""
 LABELS = (
-    "left stick ↑ / ↓",
-    "left stick ← / →",
-    "RT / LT, right stick ↑ / ↓",
-    "RB / LB",
-    "D-pad ↑ / ↓",
-    "right stick ← / →",
-    "D-pad ← / →",
+    "left stick ↑↓",
+    "left stick ←→",
+    "RT, LT; right stick ↑↓",
+    "RB, LB",
+    "D-pad ↑↓",
+    "right stick ←→",
+    "D-pad ←→",
 )
 """The controls that raise and lower the numbers of the action, in the order of `drive_keys.PAIRS`."""
 GRIPPER_LABEL = "A"

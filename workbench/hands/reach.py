@@ -90,12 +90,13 @@ def answered(reach: Reach, event: Reached) -> Reach:
 
 
 def stepped(reach: Reach, event: Stepped) -> Reach:
-    """Envs that were reset or restored have no targets. The answer to a completed move stays, so that it can be read."""
+    """Envs that were reset or restored have no targets. Why a completed move fell short stays, so that it can be read."""
     gone = {key for key in reach.targets if event.reset_mask[key[0]]} if reach.targets else set()
     if not gone:
         return reach
     moved = "" if event.restored is None else event.restored.moved
-    return _without(reach, gone, {key for key in gone if key[1] != moved})
+    fell_short = {key for key in gone if key[1] == moved and key in reach.reached and reach.reached[key].why}
+    return _without(reach, gone, gone - fell_short)
 
 
 def let_go(reach: Reach, env: int | None = None) -> list[Any]:

@@ -118,7 +118,13 @@ def test_of_many_events_each_part_of_the_strip_shows_the_worst() -> None:
 
 
 def test_an_event_that_lasts_several_steps_has_one_mark() -> None:
-    late = ((150, TRUNCATED), (151, TRUNCATED), (152, TRUNCATED), (153, TRUNCATED | SUCCESS), (160, TRUNCATED))
+    late = (
+        (150, TRUNCATED),
+        (151, TRUNCATED),
+        (152, TRUNCATED),
+        (153, TRUNCATED | SUCCESS),
+        (160, TRUNCATED),
+    )
     html, _ = strip_html(strip(events=late), running(4, timeline=past()))
     assert [(place, style) for place, style, _ in marks(html)] == [
         (50.0, "limit"),
