@@ -65,7 +65,7 @@ class DriveRobot(Command, frozen=True):
 
 
 class ToggleReach(Command, frozen=True):
-    """Show handles at the end effectors of the selected env, which the arms follow, or hide them."""
+    """Show handles at the end effectors that the arms follow, or hide them."""
 
     key = "i"
     context = "live"
