@@ -40,7 +40,7 @@ MAX_CLICKABLE_LINES = 64
 """If the plot has more lines than this, they cannot be clicked."""
 MAX_SHOWN_EPISODES = 5
 """Number of best and of worst episodes of a point that are shown."""
-WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
+WIDTH, TOP, BOTTOM, SIDE = 500, 46, 208, 34
 """In pixels: width of the plot, y of the upper and lower ends of its axes, and margin beside the outer
 axes."""
 _TERMS = "reward_terms/"

@@ -374,7 +374,9 @@ def strip_values(
         return round(100 * (min(max(at, low), high) - low) / max(high - low, 1), 3)
 
     kinds = [(style, name) for style, name in NAMES.items() if style in styles]
-    return {"place": place, "lines": reward_lines(reward), "kinds": kinds}
+    finite = reward[np.isfinite(reward)]
+    span = [_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None
+    return {"place": place, "lines": reward_lines(reward), "span": span, "kinds": kinds}
 
 
 def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
@@ -421,7 +423,7 @@ def strip_html(
     is_known = column != REWARD or view.task is None or view.task.reward_mode != "none"
     # ManiSkill returns the reward 0 for a task without a reward.
     numbers = strip.values if is_known else np.full_like(strip.values, np.nan)
-    marks, finite = marks_of(strip), numbers[np.isfinite(numbers)]
+    marks = marks_of(strip)
     values = {
         "strip": strip,
         "seek": seek,
@@ -430,7 +432,6 @@ def strip_html(
         "ago": ago_in_words(view.timeline),
         "where": step_in_words(view),
         "time": time_in_words(view),
-        "span": [_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None,
         "megabytes": megabytes,
         "curve": column.label,
         **strip_values(strip.low, strip.high, numbers, {style for _, style, _ in marks}),
