@@ -19,7 +19,7 @@ from tests.drive.scenes import running
 from tests.drive.session import live_session, start_over, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import ToggleDriving
-from workbench.hands.drive_keys import KEYS, PAIRS, bindings, driven_action
+from workbench.hands.drive_keys import KEYS, PAIRS, SHARE, bindings, driven_action
 from workbench.hands.drive_panel import yaw_of
 from workbench.hands.state import Driven, Hands, apply
 from workbench.live.commands import PauseRun, UseControlMode
@@ -57,7 +57,7 @@ def test_values_are_within_the_bounds_and_opposite_keys_cancel(keys: set[str], y
     ],
 )
 def test_keys_move_an_end_effector_as_the_person_sees_it(key: str, yaw: float, x: float, y: float) -> None:
-    assert driven_action(PANDA, (key,), yaw)[1][:2] == pytest.approx((x, y), abs=1e-9)
+    assert driven_action(PANDA, (key,), yaw)[1][:2] == pytest.approx((SHARE * x, SHARE * y), abs=1e-9)
 
 
 def test_the_gripper_changes_once_for_each_press_of_its_key() -> None:
@@ -71,7 +71,7 @@ def test_the_gripper_changes_once_for_each_press_of_its_key() -> None:
 
 def test_the_view_decides_no_other_number_than_x_and_y() -> None:
     joints = tuple(ActionDimension(f"arm/joint{k}", -1.0, 1.0) for k in range(9))
-    assert {driven_action(joints, ("w",), yaw)[1] for yaw in (0.0, 1.0, 2.0)} == {(1.0, 0, 0, 0, 0, 0, 0)}
+    assert {driven_action(joints, ("w",), yaw)[1] for yaw in (0.0, 1.0, 2.0)} == {(SHARE, 0, 0, 0, 0, 0, 0)}
     absolute = tuple(ActionDimension(one.name, -1.0, 1.0, zero_holds=False) for one in joints)
     assert not bindings(absolute)
 

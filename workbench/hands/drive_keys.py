@@ -23,6 +23,9 @@ PAIRS = (
 effector these are x, y, z and rotations about x, y, z."""
 GRIPPER_KEY = "g"
 KEYS = (*(key for pair in PAIRS for key in pair), GRIPPER_KEY)
+SHARE = 0.5
+"""Share of the bounds while a key is held. At the bounds of ManiSkill's Panda, 0.1 m a step, an end effector moves too
+fast for a person to place it."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def driven_action(
         cos, sin = np.cos(yaw), np.sin(yaw)
         amounts[:2] = cos * ahead - sin * left, sin * ahead + cos * left
     values = [
-        min(abs(amount), 1.0) * (one.high if amount > 0 else one.low)
+        SHARE * min(abs(amount), 1.0) * (one.high if amount > 0 else one.low)
         for amount, one in zip(amounts, bound, strict=True)
     ]
     return tuple(one.dimension for one in bound), tuple(map(float, values))
