@@ -41,7 +41,7 @@ from workbench.live.run import PastLoad
 from workbench.live.view import SessionView
 from workbench.page.commands import TellOpenTab, TellUnfolded, ToggleTable
 from workbench.planning.seeds_report import SolvedSeed, SolveReport
-from workbench.record.saving_state import SaveStatus
+from workbench.record.saving_state import KeptEpisodes, SaveStatus
 from workbench.record.state import RecordingStatus
 from workbench.rescore.past_scores import PastRun, RescoredCurve
 from workbench.rescore.state import RescoreView
@@ -203,6 +203,9 @@ CHANGES: dict[str, Any] = {
     "moves of all envs": just(hands=Hands(all_envs=True)),
     "another keyframe": lambda view: other_task(view, robots=(replace(ARM, keyframes=(RobotKeyframe("up", (0.1,), None),)),)),
     "handles at the end effectors": just(hands=Hands(reach=Reach(shown=True))),
+    "a driven episode is kept": just(
+        hands=Hands(driving=True, note="kept"), recording=RecordingStatus(kept=KeptEpisodes(1, 1))
+    ),
     "a condition to pause at": just(pause_when=PauseWhen("reward", "rises above", 0.5)),
     "a pause at a condition": just(pause_when=PauseWhen("success"), paused_at=30),
     "a picture": just(pictures=picture(200), pictures_serial=2),

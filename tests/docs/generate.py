@@ -60,6 +60,7 @@ CLI_COMMANDS = (
 
 def keys_page() -> str:
     studio = [kind for kind in COMMANDS if kind.__module__ == cameras.__name__]
+    driving = [kind for kind in COMMANDS if kind.context == "driving"]
     live = [kind for kind in COMMANDS if kind.context in ("page", "live") and kind not in studio]
     review = [kind for kind in COMMANDS if kind.context in ("page", "review", "library")]
     return "\n".join(
@@ -78,6 +79,10 @@ def keys_page() -> str:
             "### The camera that is chosen in the Studio",
             "",
             *table(studio),
+            "",
+            "### While you drive the robot",
+            "",
+            *table(driving),
             "",
             "## Review and library",
             "",

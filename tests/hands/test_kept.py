@@ -13,14 +13,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import jump, live_session, step, wait_until
+from tests.drive.session import (
+    after_worker_reply,
+    jump,
+    live_session,
+    moment_at,
+    start_over,
+    step,
+    wait_until,
+)
 from workbench.app.session import Session
 from workbench.cli.main import main
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.hands.commands import ToggleDriving
+from workbench.hands.commands import BeginAgain, DiscardEpisode, KeepEpisode, ToggleDriving
 from workbench.hands.drive_keys import GRIPPER_KEY, PAIRS
-from workbench.hands.state import Driven
+from workbench.hands.state import BodyMoved, Driven, Hands
+from workbench.live.commands import PauseRun
+from workbench.live.timeline_commands import UndoReset
+from workbench.page.command import Refused
 from workbench.record.commands import StopRecording
+from workbench.record.saving_state import KeptEpisodes
 from workbench.record.state import RecordingStatus, RecordingWanted
 
 ENV = 1
@@ -28,7 +40,7 @@ MOST_STEPS = 120
 TCP = "panda/panda_hand_tcp"
 
 
-@pytest.fixture(scope="module", params=["pd_ee_delta_pos", "pd_ee_delta_pose"])
+@pytest.fixture(scope="module", params=["pd_ee_delta_pose"])
 def session(
     request: pytest.FixtureRequest, child_process: None, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Session]:
@@ -36,6 +48,36 @@ def session(
     with live_session("PushCube-v1", where, num_envs=2, control_mode=request.param) as session:
         session.change(selected_env=ENV)
         yield session
+
+
+@pytest.fixture
+def driven(session: Session) -> Iterator[Session]:
+    """The session with a driven env that stands at the beginning of an episode."""
+    start_over(session, 0)
+    session.do(ToggleDriving())
+    session.do(PauseRun())
+    after_worker_reply(session)
+    jump(session, lambda: session.do(BeginAgain()))
+    yield session
+    session.do(ToggleDriving())
+    session.do(PauseRun())
+
+
+def kept(session: Session) -> KeptEpisodes:
+    return session.view().of(RecordingStatus).kept
+
+
+def drive(session: Session, steps: int) -> None:
+    for _ in range(steps):
+        session.happen(Driven(("w",), 0.0))
+        step(session)
+
+
+def seed(session: Session) -> int:
+    """Seed of the driven env's last reset."""
+    newest = moment_at(session, session.view().timeline.last)
+    assert newest is not None and newest.seeds is not None
+    return int(newest.seeds[ENV])
 
 
 def position(session: Session, body: str) -> np.ndarray:
@@ -66,7 +108,7 @@ def drive_to_success(session: Session) -> int:
     raise AssertionError("the cube did not reach the goal")
 
 
-def replayed_success(recording: Path, tmp_path: Path) -> str:
+def replayed(recording: Path, tmp_path: Path) -> str:
     """What ManiSkill's ``replay_trajectory`` prints after it has replayed the actions of an exported recording."""
     file = tmp_path / "demos.h5"
     with pytest.raises(SystemExit) as ended:
@@ -79,15 +121,89 @@ def replayed_success(recording: Path, tmp_path: Path) -> str:
 
 
 @pytest.mark.slow
-def test_a_driven_episode_is_recorded_and_maniskill_replays_it_to_success(session: Session, tmp_path: Path) -> None:
+@pytest.mark.parametrize("session", ["pd_ee_delta_pos"], indirect=True)
+def test_a_driven_episode_is_recorded_and_maniskill_replays_it_to_success(
+    session: Session, tmp_path: Path
+) -> None:
     session.do(ToggleDriving())
+    session.do(PauseRun())
+    after_worker_reply(session)
     jump(session, lambda: session.happen(RecordingWanted((ENV,))))
-    print(drive_to_success(session))
-    view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written >= 1, "the files")
+    drive_to_success(session)
+    view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written, "the files")
+    with pytest.raises(Refused, match="Shift\\+C"):
+        session.do(KeepEpisode())
     session.do(StopRecording())
-    recording = view.of(RecordingStatus)
-    assert recording.problem is None
-    episode = read_episode(Path(recording.last_file))
-    assert {by for _, by in episode.info.acted_by} == {"sliders"}
-    assert episode.flags["success"][-1]
-    assert "1/1=100.00% demos saved" in replayed_success(Path(recording.last_file), tmp_path)
+    assert view.of(RecordingStatus).problem is None
+    recording = Path(view.of(RecordingStatus).last_file or "")
+    episode = read_episode(recording)
+    assert {by for _, by in episode.info.acted_by} == {"sliders"} and episode.flags["success"][-1]
+    assert "1/1=100.00% demos saved" in replayed(recording, tmp_path)
+
+
+@pytest.mark.slow
+def test_maniskill_replays_a_kept_episode_to_success(driven: Session, tmp_path: Path) -> None:
+    before = kept(driven)
+    drive_to_success(driven)
+    drive(driven, 2)
+    driven.do(KeepEpisode())
+    view = wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
+    assert view.of(RecordingStatus).kept.successes == before.successes + 1
+    assert "1/1=100.00% demos saved" in replayed(Path(view.of(RecordingStatus).last_file or ""), tmp_path)
+
+
+def test_a_kept_episode_goes_on_after_the_time_limit_and_the_next_seed_begins(driven: Session) -> None:
+    before, first = kept(driven), seed(driven)
+    drive(driven, 51)
+    assert driven.view().step.truncated[ENV]
+    jump(driven, lambda: driven.do(KeepEpisode()))
+    assert seed(driven) == first + 1 and f"seed {first} (51 steps) is kept" in driven.view().of(Hands).note
+    with pytest.raises(Refused, match="kept already"):
+        driven.do(KeepEpisode())
+    view = wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
+    assert view.of(RecordingStatus).kept.successes == before.successes
+    episode = read_episode(Path(view.of(RecordingStatus).last_file or ""))
+    assert (episode.info.seed, episode.info.env_index, episode.length) == (first, ENV, 51)
+
+
+def test_nothing_is_saved_of_a_discarded_episode_and_undo_brings_it_back(driven: Session) -> None:
+    before, first = driven.view().of(RecordingStatus), seed(driven)
+    with pytest.raises(Refused, match="no step yet"):
+        driven.do(DiscardEpisode())
+    drive(driven, 3)
+    stood = driven.view().step.poses[ENV].copy()
+    jump(driven, lambda: driven.do(DiscardEpisode()))
+    assert seed(driven) == first and driven.view().step.elapsed_steps[ENV] == 0
+    assert "discarded" in driven.view().of(Hands).note
+    jump(driven, lambda: driven.do(UndoReset()))
+    np.testing.assert_array_equal(driven.view().step.poses[ENV], stood)
+    jump(driven, lambda: driven.do(BeginAgain()))
+    assert seed(driven) == first + 1 and "was not kept" in driven.view().of(Hands).note
+    jump(driven, lambda: driven.do(BeginAgain()))
+    assert seed(driven) == first + 2 and not driven.view().of(Hands).note
+    assert driven.view().of(RecordingStatus) == before
+
+
+def test_the_episode_that_was_just_left_can_be_kept(driven: Session) -> None:
+    before, first = kept(driven), seed(driven)
+    drive(driven, 2)
+    jump(driven, lambda: driven.do(BeginAgain()))
+    driven.do(KeepEpisode())
+    assert seed(driven) == first + 1, "the episode that has begun goes on"
+    wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
+
+
+def test_what_a_hand_moved_is_told_when_the_episode_is_kept(driven: Session) -> None:
+    before = kept(driven)
+    drive(driven, 1)
+    jump(driven, lambda: driven.happen(BodyMoved("cube", (ENV,), (0.0, 0.2, 0.02, 1.0, 0.0, 0.0, 0.0))))
+    drive(driven, 1)
+    driven.do(KeepEpisode())
+    assert "by hand" in driven.view().of(Hands).note
+    wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
+
+
+def test_a_person_who_does_not_drive_keeps_nothing(session: Session) -> None:
+    for command in (KeepEpisode(), DiscardEpisode(), BeginAgain()):
+        with pytest.raises(Refused, match="Drive first"):
+            session.do(command)

@@ -43,7 +43,17 @@ from workbench.record.commands import (
     ToggleSavePast,
 )
 from workbench.record.gather import Finished
-from workbench.record.saving_state import BeginSaving, EpisodesSaved, SaveFailed, SaveProgressed, SaveWanted
+from workbench.record.saving_state import (
+    BeginSaving,
+    EpisodesKept,
+    EpisodesSaved,
+    KeptEpisodes,
+    SaveFailed,
+    SaveProgressed,
+    SaveRequest,
+    SaveWanted,
+    request_of,
+)
 from workbench.record.state import (
     BeginEpisodes,
     EndEpisodes,
@@ -256,6 +266,30 @@ def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):
         apply_filtered(state, Asked(SaveSolved()))
+
+
+def test_kept_episodes_are_saved_one_after_another_and_a_stop_counts_those_that_are_lost() -> None:
+    success = moment(np.full(ENVS, 1, np.int32), success=(1,), number=1)
+    state, _ = after(loaded(), RESET, success)
+    begun: list[int] = []
+
+    def tell(event: SessionEvent) -> KeptEpisodes:
+        nonlocal state
+        state, effects = apply_filtered(state, event)
+        begun.extend(effect.what.episodes[0].env for effect in effects if isinstance(effect, BeginSaving))
+        return state.recording.status(state.run).kept
+
+    for env in range(ENVS):
+        what = request_of(state.run, (env,), kept=True)
+        assert isinstance(what, SaveRequest)
+        tell(EpisodesKept(what))
+    assert tell(SaveWanted((0,))).waiting == ENVS and begun == [0], "a save in between waits"
+    assert tell(SaveFailed(1, "full")) == KeptEpisodes(0, 0, 2, 1, "full")
+    assert tell(EpisodesSaved(2, "saved")) == KeptEpisodes(1, 1, 1, 1, "full")
+    assert begun == [0, 1, 2]
+    stopped = tell(Asked(ToggleSavePast()))
+    assert (stopped.saved, stopped.waiting, stopped.failed) == (1, 0, 2) and "1 kept episode" in stopped.why
+    assert tell(EpisodesSaved(3, "late")) == stopped and begun == [0, 1, 2]
 
 
 def test_a_rescoring_stopped_by_a_save_restarts_if_the_version_stays_the_same() -> None:

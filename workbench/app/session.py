@@ -21,6 +21,8 @@ from workbench.cameras.state import view_of as studio_view_of
 from workbench.checks.profile import BeginProfile, EndProfile, ProfileJobs
 from workbench.checks.state import BeginCheck, CheckJobs, Checks, ChecksView, EndCheck, KeepCheckAfterSave
 from workbench.envs.recorded_run import RecordedRun
+from workbench.hands.pose_edit import ChangePoseFile, CheckPose, PlanPose
+from workbench.hands.pose_jobs import PoseJobs
 from workbench.hands.resets import BeginSampling, EndSampling, ResetJobs
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import (
@@ -126,6 +128,7 @@ class Session:
         """Reference with which the task was opened; see also `present_reference`."""
         self._on_event = on_event
         self._print = on_line
+        self._on_notice = on_notice
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
@@ -162,6 +165,7 @@ class Session:
         self._seeds = SeedsJobs(recordings, self._happen)
         self._policies = PolicySearch(self._happen)
         self._resets = ResetJobs(self._background, self._happen)
+        self._poses = PoseJobs(self._background, self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Created after the parts above, since it reports recovered episodes at once.
@@ -242,6 +246,8 @@ class Session:
                 self._profiles.perform(effect)
             case BeginSampling() | EndSampling():
                 self._resets.perform(effect)
+            case PlanPose() | ChangePoseFile() | CheckPose():
+                self._poses.perform(effect)
             case BeginPlan() | EndPlan():
                 self._plans.perform(effect)
             case BeginSeeds() | EndSeeds():
@@ -290,6 +296,7 @@ class Session:
             studio_view_of(state.studio, run, self._studio.progress),
             state.hands,
             state.resets,
+            state.pose_edit,
         )
         return view_of(
             self._run,
@@ -370,6 +377,8 @@ class Session:
 
     def close(self) -> None:
         """End all processes and threads; waits for episodes that are being written. Must not be called on the loop."""
+        if lost := do(lambda: self._state.recording.saving.kept.waiting):
+            self._on_notice(f"The session ended before all kept episodes were saved: {lost} are lost.")
         stop_listening(self._log)
         self._changes.close()
         self._worker.stop()
@@ -380,6 +389,7 @@ class Session:
         self._checks.close()
         self._profiles.close()
         self._resets.close()
+        self._poses.close()
         self._plans.close()
         self._seeds.close()
         self._policies.close()

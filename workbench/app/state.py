@@ -9,6 +9,7 @@ from workbench.cameras.events import StudioEffect, StudioEvent
 from workbench.cameras.state import Studio
 from workbench.checks import profile as of_profile
 from workbench.checks import state as of_checks
+from workbench.hands import pose_edit as of_pose
 from workbench.hands import resets as of_resets
 from workbench.hands import state as of_hands
 from workbench.live import apply as of_run
@@ -38,6 +39,7 @@ SessionEvent = (
     | StudioEvent
     | of_hands.HandEvent
     | of_resets.ResetsEvent
+    | of_pose.PoseEvent
 )
 Effect = (
     RunEffect
@@ -51,6 +53,7 @@ Effect = (
     | of_policies.ListPolicies
     | StudioEffect
     | of_resets.ResetsEffect
+    | of_pose.PoseEffect
     | Then
 )
 DOES: frozenset[type[Command]] = (
@@ -64,6 +67,7 @@ DOES: frozenset[type[Command]] = (
     | of_studio.DOES
     | of_hands.DOES
     | of_resets.DOES
+    | of_pose.DOES
 )
 """Commands that `apply` handles."""
 
@@ -92,6 +96,8 @@ class State:
     """A person who drives the robot."""
     resets: of_resets.ResetCloud = of_resets.ResetCloud()
     """Where resets put the bodies."""
+    pose_edit: of_pose.PoseEdit = of_pose.PoseEdit()
+    """The change of the file that gives a body another first pose."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -110,9 +116,12 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     solving, for_solver = of_solver.apply(state.solving, event, run)
     policies, for_policies = of_policies.apply(state.policies, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
-    hands, for_hands = of_hands.apply(state.hands, event, run)
+    hands, for_hands = of_hands.apply(state.hands, event, run, recording.env_idx)
     resets, for_resets = of_resets.apply(state.resets, event, run)
-    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies, hands, resets)
+    pose, for_pose = of_pose.apply(state.pose_edit, event, run)
+    new = State(
+        run, recording, studio, rescoring, checks, profile, seeds, solving, policies, hands, resets, pose
+    )
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
     # before the checks, so that the checks run first. Effects of the run come after the jobs: when a load is
@@ -125,5 +134,6 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         *for_seeds,
         *for_solver,
         *for_resets,
+        *for_pose,
     ]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio, *for_hands]

@@ -37,6 +37,30 @@ class ToggleHandles(Command, frozen=True):
     context = "live"
 
 
+class WriteBodyPose(Command, frozen=True):
+    """Show the change of the file that lets the selected body begin where it is now."""
+
+    context = "live"
+
+
+class SavePoseChange(Command, frozen=True):
+    """Save the shown change of a body's first pose to the file."""
+
+    context = "live"
+
+
+class RevertPoseChange(Command, frozen=True):
+    """Revert the saved change of a body's first pose in the file."""
+
+    context = "live"
+
+
+class DropPoseChange(Command, frozen=True):
+    """Close the change of a body's first pose; the file stays as it is."""
+
+    context = "live"
+
+
 class SampleResets(Command, frozen=True):
     """Show where resets with other seeds put the selected body."""
 
@@ -54,6 +78,27 @@ class ToggleDriving(Command, frozen=True):
 
     key = "k"
     context = "live"
+
+
+class BeginAgain(Command, frozen=True):
+    """Reset the driven env with the next seed, without keeping its episode."""
+
+    key = "z"
+    context = "driving"
+
+
+class DiscardEpisode(Command, frozen=True):
+    """Discard the driven episode, and begin it again with the same seed."""
+
+    key = "x"
+    context = "driving"
+
+
+class KeepEpisode(Command, frozen=True):
+    """Save the driven episode, and begin the next one with the next seed."""
+
+    key = "c"
+    context = "driving"
 
 
 class DriveRobot(Command, frozen=True):

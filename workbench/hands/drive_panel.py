@@ -8,7 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from workbench.hands.commands import DriveRobot, ToggleDriving, ToggleReach
+from workbench.hands.commands import (
+    BeginAgain,
+    DiscardEpisode,
+    DriveRobot,
+    KeepEpisode,
+    ToggleDriving,
+    ToggleReach,
+)
 from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, KeyBinding, bindings, gripper
 from workbench.hands.gamepad import GRIPPER_LABEL, LABELS, pad_amounts, pad_grips
 from workbench.hands.reach import why_no_arm
@@ -19,8 +26,12 @@ from workbench.page.command import SHORT_NAMES, Command, key_in_words, name_of
 from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
-from workbench.page.widgets.tools import Tool, tools_html
+from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.page.widgets.visitors import Visitor
+from workbench.record.state import RecordingStatus
+
+SET = (("Keep", KeepEpisode()), ("Discard", DiscardEpisode()), ("Again", BeginAgain()))
+"""Buttons that end the driven episode."""
 
 
 class DrivePanel(PagePart[SessionView]):
@@ -38,10 +49,12 @@ class DrivePanel(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         hands = view.of(Hands)
-        return hands.driving, hands.reach.shown, view.task_serial, view.selected_env
+        kept = view.of(RecordingStatus).kept
+        return hands.driving, hands.reach.shown, hands.note, kept, view.task_serial, view.selected_env
 
     def draw(self, view: SessionView) -> None:
-        driving, reaches = view.of(Hands).driving, view.of(Hands).reach.shown
+        hands = view.of(Hands)
+        driving, reaches = hands.driving, hands.reach.shown
         actions = () if view.task is None else view.task.actions
         button = Tool(
             "Stop driving" if driving else "Drive by keys",
@@ -59,7 +72,10 @@ class DrivePanel(PagePart[SessionView]):
             off=view.task is None or bool(armless),
         )
         rows = _rows(bindings(actions), bool(gripper(actions))) if driving else []
-        self._html.content = tools_html([button, reach]) + render("drive_keys", rows=rows)
+        of_set = [tool(name, command) for name, command in SET] if driving else []
+        self._html.content = tools_html([button, reach], of_set) + render(
+            "drive_keys", rows=rows, note=hands.note, kept=view.of(RecordingStatus).kept
+        )
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:

@@ -22,7 +22,10 @@ from workbench.hands.commands import (
     SetBodyAngle,
     SetBodyPosition,
     ToggleHandles,
+    WriteBodyPose,
 )
+from workbench.hands.pose_edit import PoseEdit, PoseWanted
+from workbench.hands.pose_panel import pose_edit_html
 from workbench.hands.resets import ResetCloud
 from workbench.hands.state import BodyMoved, BodyPulled, Hands, why_not_moved, why_not_pulled
 from workbench.live.messages import PullBody
@@ -102,7 +105,7 @@ class HandsPanel(PagePart[SessionView]):
         order: viser's order of the fold in its tab.
     """
 
-    does = (SetBodyPosition, SetBodyAngle, ToggleHandles)
+    does = (SetBodyPosition, SetBodyAngle, ToggleHandles, WriteBodyPose)
 
     def __init__(
         self,
@@ -126,6 +129,7 @@ class HandsPanel(PagePart[SessionView]):
             self._angles = self._row("Rotation", SetBodyAngle, ANGLES, "Degrees about fixed axes.", 1.0)
             self._scope = scope_choice(server)
             self._tools = server.gui.add_html("")
+            self._change = server.gui.add_html("", visible=False)
             self._spread = server.gui.add_html("", visible=False)
         self._points = InView(
             partial(
@@ -159,7 +163,14 @@ class HandsPanel(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         shown = view.step_serial, view.task_serial, view.selected_env, self._body(), id(self._drag)
-        return *shown, self._handles_on, view.of(Hands).all_envs, view.of(ResetCloud).serial
+        return (
+            *shown,
+            self._handles_on,
+            view.of(Hands).all_envs,
+            view.playing,
+            view.of(ResetCloud).serial,
+            view.of(PoseEdit),
+        )
 
     def draw(self, view: SessionView) -> None:
         task, step = view.task, view.step
@@ -184,7 +195,12 @@ class HandsPanel(PagePart[SessionView]):
         shows = cloud.state != "none"
         sampled: Command = HideResets() if shows else SampleResets()
         resets = Tool("Where resets put it", sampled, type(sampled).help(), on=shows)
-        self._tools.content = tools_html([handles, resets])
+        write = Tool(
+            "Write into the file", WriteBodyPose(), WriteBodyPose.help(), off=bool(why) or view.playing
+        )
+        self._tools.content = tools_html([handles, resets], [write])
+        edit = view.of(PoseEdit)
+        self._change.content, self._change.visible = pose_edit_html(edit), edit.stage != "none"
         self._spread.content, self._spread.visible = render("note", text=spread_text(cloud, known.row)), shows
         name_fold(self._fold, TITLE, known.body)
 
@@ -192,6 +208,11 @@ class HandsPanel(PagePart[SessionView]):
         match command:
             case ToggleHandles():
                 self._handles_on = not self._handles_on
+            case WriteBodyPose():
+                of = self._required()
+                if why := why_not_moved(of.kind):
+                    raise Refused(why)
+                self._session.happen(PoseWanted(of.body, tuple(map(float, of.pose))))
             case SetBodyPosition(of=axis, to=metres):
                 pose = self._required().pose.copy()
                 pose[XYZ.index(axis)] = metres

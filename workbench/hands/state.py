@@ -9,8 +9,11 @@ from workbench.actions.sources import ActionSource
 from workbench.envs.robots import Joint, Robot
 from workbench.hands import reach as of_reach
 from workbench.hands.commands import (
+    BeginAgain,
     ChooseMovedEnvs,
+    DiscardEpisode,
     DragJoint,
+    KeepEpisode,
     SetJoint,
     ToggleDriving,
     ToggleReach,
@@ -21,7 +24,8 @@ from workbench.hands.joints import position_of
 from workbench.hands.reach import ArmDragged, ArmsReleased, Reach
 from workbench.live.commands import PlayRun
 from workbench.live.effects import Asked, Later, Then
-from workbench.live.events import PagesCounted, Send, SettingsChanged, VersionLoaded, WorkerDied
+from workbench.live.events import EnvsReset, PagesCounted, Send, SettingsChanged, VersionLoaded, WorkerDied
+from workbench.live.history.moments import Moment
 from workbench.live.messages import (
     EpisodeEnd,
     MoveBody,
@@ -33,10 +37,21 @@ from workbench.live.messages import (
 )
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
+from workbench.record.saving_state import EpisodesKept, PastEpisode, find_episode, request_of
 from workbench.task.description import Stepped
 
 DOES: frozenset[type[Command]] = frozenset(
-    {ToggleDriving, ToggleReach, ChooseMovedEnvs, DragJoint, SetJoint, UseKeyframe}
+    {
+        ToggleDriving,
+        ToggleReach,
+        BeginAgain,
+        DiscardEpisode,
+        KeepEpisode,
+        ChooseMovedEnvs,
+        DragJoint,
+        SetJoint,
+        UseKeyframe,
+    }
 )
 """Commands that `apply` handles."""
 LET_GO_SECONDS = 0.3
@@ -113,14 +128,23 @@ class Hands:
     """Whether a move applies to all envs; if False, to the selected one."""
     dragged: DraggedJoint | None = None
     """A joint that the page shows elsewhere than in the env, during a drag and until the env has followed."""
+    next_seed: int = 0
+    """Minimum seed of the next episode of the set."""
+    kept: Moment | None = None
+    """First moment of the episode that was kept last."""
+    note: str = ""
+    """What became of the last episode of the set."""
 
 
 HandEvent = BodyMoved | BodyPulled | Driven | DrivingDue | ArmDragged | ArmsReleased | Reached
 Change = tuple[Hands, list[Any]]
 
 
-def apply(hands: Hands, event: object, run: Run) -> Change:
+def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ()) -> Change:
     """The next state after an event, and the effects to perform.
+
+    Args:
+        recorded: envs whose episodes are all recorded.
 
     Raises:
         Refused: the body or the joints cannot be moved, or the robot cannot be driven now; nothing has changed.
@@ -140,7 +164,9 @@ def apply(hands: Hands, event: object, run: Run) -> Change:
         case Asked(command=UseKeyframe(robot=robot, name=name)):
             return hands, [_use_keyframe(hands, run, robot, name)]
         case Stepped() | TaskFailed() | VersionLoaded() | PagesCounted() | WorkerDied() if hands.dragged:
-            return apply(replace(hands, dragged=None), event, run)
+            return apply(replace(hands, dragged=None), event, run, recorded)
+        case Asked(command=BeginAgain() | DiscardEpisode() | KeepEpisode() as command):
+            return _end_episode(hands, run, command, recorded)
         case Driven(keys=keys, yaw=yaw, sticks=sticks) if hands.driving:
             return _drive(replace(hands, number=hands.number + 1), run, keys, yaw, sticks)
         case DrivingDue(number=hands.number) if hands.driving and (hands.keys or hands.sticks):
@@ -189,6 +215,7 @@ def _take_over(hands: Hands, run: Run) -> Change:
         keys=(),
         sticks=(),
         closes=False,
+        note="",
     )
     # An episode that ends by itself would take the robot out of the hand.
     changed = SettingsChanged({"action_source": "sliders", "episode_end": "continue"})
@@ -237,6 +264,64 @@ def _drive(
     if keys or sticks:
         told.append(Later(LET_GO_SECONDS, DrivingDue(hands.number)))
     return replace(hands, keys=keys, sticks=sticks, closes=closes, reach=reach), told
+
+
+def _end_episode(
+    hands: Hands, run: Run, command: BeginAgain | DiscardEpisode | KeepEpisode, recorded: tuple[int, ...]
+) -> Change:
+    """Keep or leave the driven episode, and begin the next. An episode that is not kept stays in the history only."""
+    if not hands.driving:
+        raise Refused("Drive first (K): episodes are kept and discarded while you drive.")
+    _require_live(run)
+    assert run.past is not None, "there is a live moment"
+    env, history = run.env, run.past.history
+    next_seed = max(hands.next_seed, run.seed + run.num_envs)
+    episode = find_episode(history, env, None, limited=False)
+    has_step = len(history.episode(env, history.last, 2)) > 1
+    if isinstance(command, BeginAgain):
+        note = ""
+        if isinstance(episode, PastEpisode) and has_step and env not in recorded:
+            note = f"{_named(episode)} was not kept. Shift+U goes back to it."
+        return _begin_episode(replace(hands, note=note), env, next_seed)
+    if env in recorded:
+        raise Refused("Each episode of this env is recorded now. To choose, stop the recording (Shift+C).")
+    if isinstance(episode, str):
+        raise Refused(f"There is no episode to keep or discard: {episode}.")
+    if isinstance(command, KeepEpisode):
+        hands, told = _keep(hands, run, episode)
+        if not has_step:  # the next episode has begun already
+            return hands, told
+        hands, more = _begin_episode(hands, env, next_seed)
+        return hands, [*told, *more]
+    if not has_step:
+        raise Refused("There is no episode to discard: this one has no step yet.")
+    hands = replace(hands, note=f"{_named(episode)} was discarded. Shift+U brings it back.")
+    return _begin_episode(hands, env, next_seed if episode.seed < 0 else episode.seed)
+
+
+def _keep(hands: Hands, run: Run, episode: PastEpisode) -> Change:
+    """Save this episode, which is the one at the newest moment."""
+    assert run.past is not None, "an episode was found"
+    first, last = episode.moments[0][0], episode.moments[-1]
+    if first is hands.kept:
+        raise Refused("This episode is kept already.")
+    what = request_of(run, (run.env,), kept=True)
+    if isinstance(what, str):
+        raise Refused(f"{what}.")
+    note = f"{_named(episode)} is kept, {'with' if episode.succeeded else 'without'} success."
+    if run.past.history.by_hand(*last):
+        note += " A body was moved or pulled by hand in it, so its actions alone do not repeat it."
+    return replace(hands, kept=first, note=note), [Then(EpisodesKept(what))]
+
+
+def _begin_episode(hands: Hands, env: int, seed: int) -> Change:
+    begun = replace(hands, closes=False, next_seed=max(hands.next_seed, seed + 1))
+    return begun, [Send(SetSliderAction((env,), (), ())), Then(EnvsReset((env,), seed))]
+
+
+def _named(episode: PastEpisode) -> str:
+    of = "" if episode.seed < 0 else f" of seed {episode.seed}"
+    return f"The episode{of} ({episode.steps} step{'' if episode.steps == 1 else 's'})"
 
 
 def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:

@@ -244,8 +244,8 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             return replace(run, read_sections=sections, read_body=body), []
         case ReadingDue():
             return read(run, now)
-        case EnvsReset(env_idx=env_idx):
-            return _reset(run, env_idx)
+        case EnvsReset(env_idx=env_idx, seed=seed):
+            return _reset(run, env_idx, seed)
         case RunToEnter():
             return _enter(run, event)
     return run, []
@@ -364,8 +364,8 @@ def _play(run: Run, playing: bool) -> Change:
     return run, [Send(Play(playing, run.plays_asked))]
 
 
-def _reset(run: Run, env_idx: tuple[int, ...] | None) -> Change:
-    return _show_live(run), [Send(Reset(env_idx, run.seed if env_idx is None else None))]
+def _reset(run: Run, env_idx: tuple[int, ...] | None, seed: int | None = None) -> Change:
+    return _show_live(run), [Send(Reset(env_idx, run.seed if env_idx is None else seed))]
 
 
 def _show_live(run: Run) -> Run:

@@ -177,9 +177,11 @@ class ReadingDue:
 
 @dataclass(frozen=True)
 class EnvsReset:
-    """Reset these envs; the task's random numbers continue. None: reset all with the session's seed."""
+    """Reset these envs. None: reset all with the session's seed."""
 
     env_idx: tuple[int, ...] | None = None
+    seed: int | None = None
+    """Seed of these envs; None continues the task's random numbers."""
 
 
 RunEvent = (

@@ -56,6 +56,8 @@ class Load(Question["Loaded"]):
     """Why a new process loads the task, for the `ReloadReport`."""
     same_scene: bool = False
     """Whether a new process loads the version, and the version's scene-building code is unchanged."""
+    fresh: bool = False
+    """Whether a build begins new episodes, instead of putting the bodies back to where they were."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from workbench.live.effects import Asked
 from workbench.live.events import VersionLoaded
 from workbench.live.history.moments import EnvMoment, History
@@ -35,12 +37,32 @@ class SaveStatus:
 
 
 @dataclass(frozen=True)
+class KeptEpisodes:
+    """The set of episodes that a person has driven and kept."""
+
+    saved: int = 0
+    successes: int = 0
+    """How many of the saved ones end in success."""
+    waiting: int = 0
+    """Kept episodes that are not saved yet."""
+    failed: int = 0
+    """Kept episodes that could not be saved."""
+    why: str = ""
+    """Why the last of them could not be saved."""
+
+
+@dataclass(frozen=True)
 class Saving:
     """State of saving past episodes, one job at a time."""
 
     status: SaveStatus = SaveStatus()
     job: int = 0
     """Number of the last job."""
+    running: SaveRequest | None = None
+    """What the running job saves; None while no job runs."""
+    waiting: tuple[SaveRequest, ...] = ()
+    """What is saved after it."""
+    kept: KeptEpisodes = KeptEpisodes()
 
     def status_of(self, run: Run) -> SaveStatus:
         """The status for the shown version, env and moment."""
@@ -49,13 +71,13 @@ class Saving:
         return SaveStatus(progress=self.status.progress)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset.
 
     If the env jumped back, the moments up to the restored one are followed by those after the jump. The last
-    moment is the one at which the env terminated or was truncated. If there is none, it is the moment before
-    the next reset or jump; in a running episode, it is the newest moment.
+    moment is the one at which the env terminated or, except in a kept episode, was truncated. If there is none, it
+    is the moment before the next reset or jump; in a running episode, it is the newest moment.
     """
 
     env: int
@@ -76,8 +98,15 @@ class PastEpisode:
         step = moment.as_recorded
         return bool(step.terminated[env] or step.truncated[env])
 
+    @property
+    def succeeded(self) -> bool:
+        """Whether the task reports success at its end."""
+        moment, env = self.moments[-1]
+        success = moment.as_recorded.evaluate.get("success")
+        return success is not None and bool(np.any(success[env]))
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class SaveRequest:
     """Past episodes to record, with all data that the worker needs, because the history changes while the job
     runs."""
@@ -86,6 +115,8 @@ class SaveRequest:
     load: Load
     """The load that gave the running version; the background worker repeats it."""
     episodes: tuple[PastEpisode, ...]
+    kept: bool = False
+    """Whether a person drives a set of episodes and keeps these; see `KeptEpisodes`."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -101,6 +132,13 @@ class SaveWanted:
     env_idx: tuple[int, ...] | None = None
     before: bool = False
     """Save the previous episode instead."""
+
+
+@dataclass(frozen=True)
+class EpisodesKept:
+    """Save these episodes after those that are being saved."""
+
+    what: SaveRequest
 
 
 @dataclass(frozen=True)
@@ -122,8 +160,8 @@ class SaveFailed:
     why: str
 
 
-SaveEvent = SaveProgressed | EpisodesSaved | SaveFailed
-"""Events of a job."""
+SaveEvent = EpisodesKept | SaveProgressed | EpisodesSaved | SaveFailed
+"""Events of saving."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +195,7 @@ def apply(
     runs = saving.status.progress is not None
     match event:
         case Asked(command=ToggleSavePast()) if runs:
-            return Saving(SaveStatus("Stopped; nothing was saved"), saving.job), [EndSaving()]
+            return _stopped(saving), [EndSaving()]
         case Asked(command=ToggleSavePast()):
             return _save(saving, run, chosen)
         case Asked(command=SavePreviousEpisode()):
@@ -174,10 +212,14 @@ def apply(
             return without_message(saving), []
         case SaveProgressed(job=saving.job, progress=progress) if runs:
             return replace(saving, status=replace(saving.status, progress=progress)), []
+        case EpisodesKept(what=what) if runs:
+            return _with_kept(replace(saving, waiting=(*saving.waiting, what)), waiting=1), []
+        case EpisodesKept(what=what):
+            return _begun(_with_kept(saving, waiting=1), what)
         case EpisodesSaved(job=saving.job, message=message) if runs:
-            return Saving(SaveStatus(message), saving.job), []
+            return _next(saving, SaveStatus(message))
         case SaveFailed(job=saving.job, why=why) if runs:
-            return Saving(SaveStatus(why, failed=True), saving.job), []
+            return _next(saving, SaveStatus(why, failed=True))
     return saving, []
 
 
@@ -195,8 +237,47 @@ def _save(
     if isinstance(what, str):
         status = SaveStatus(what, True, refused_at=_shown(run), progress=saving.status.progress)
         return replace(saving, status=status), []
+    if saving.kept.waiting:
+        return replace(saving, waiting=(*saving.waiting, what)), []
+    return _begun(saving, what)
+
+
+def _begun(
+    saving: Saving, what: SaveRequest, status: SaveStatus = SaveStatus()
+) -> tuple[Saving, list[SaveEffect]]:
+    """Begin the next job; of the last one's result, `status`, only a failure stays on the page."""
     job = saving.job + 1
-    return Saving(SaveStatus(progress=JobProgress(WAITING, 0, 0)), job), [BeginSaving(job, what)]
+    status = replace(status if status.failed else SaveStatus(), progress=JobProgress(WAITING, 0, 0))
+    return replace(saving, status=status, job=job, running=what), [BeginSaving(job, what)]
+
+
+def _next(saving: Saving, status: SaveStatus) -> tuple[Saving, list[SaveEffect]]:
+    """Handle the end of the running job, and begin the next."""
+    what = saving.running
+    if what is not None and what.kept and status.failed:
+        saving = _with_kept(saving, waiting=-1, failed=1, why=status.message)
+    elif what is not None and what.kept:
+        saving = _with_kept(saving, waiting=-1, saved=1, successes=int(what.episodes[0].succeeded))
+    if not saving.waiting:
+        return replace(saving, status=status, running=None), []
+    first, *rest = saving.waiting
+    return _begun(replace(saving, waiting=tuple(rest)), first, status)
+
+
+def _stopped(saving: Saving) -> Saving:
+    """Drop the running job and those after it."""
+    why, lost = "Stopped; nothing was saved", saving.kept.waiting
+    if lost:
+        why = f"Stopped; {lost} kept episode{' was' if lost == 1 else 's were'} not saved"
+        saving = _with_kept(saving, waiting=-lost, failed=lost, why=why)
+    return replace(saving, status=SaveStatus(why), running=None, waiting=())
+
+
+def _with_kept(saving: Saving, why: str = "", **more: int) -> Saving:
+    """The saving with its counts of kept episodes changed by `more`."""
+    kept = saving.kept
+    counts = {name: getattr(kept, name) + by for name, by in more.items()}
+    return replace(saving, kept=replace(kept, why=why or kept.why, **counts))
 
 
 def _shown(run: Run) -> object:
@@ -208,12 +289,15 @@ def _shown(run: Run) -> object:
 # --- the episodes -----------------------------------------------------------------------------------
 
 
-def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) -> SaveRequest | str:
+def request_of(
+    run: Run, env_idx: tuple[int, ...] | None, before: bool = False, kept: bool = False
+) -> SaveRequest | str:
     """The request to record, for each of these envs (all if None), the episode that contains the shown moment; or the reason
     why there is none.
 
     Args:
         before: record the previous episode instead.
+        kept: see `SaveRequest.kept`. A kept episode goes on after the time limit, until it terminates.
     """
     load = run.running_load()
     if run.task is None or run.past is None or load is None:
@@ -221,7 +305,7 @@ def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) 
     shown = run.past.shown
     serial = None if shown is None else shown.serial
     envs = range(run.num_envs) if env_idx is None else env_idx
-    found = {env: find_episode(run.past.history, env, serial, before) for env in envs}
+    found = {env: find_episode(run.past.history, env, serial, before, not kept) for env in envs}
     episodes = tuple(
         replace(episode, played_by=run.version_of(episode.moments[-1][0].serial))
         for episode in found.values()
@@ -230,26 +314,29 @@ def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) 
     if not episodes:
         env, why = next(iter(found.items()))
         return f"Nothing of env {env} was saved: {why}"
-    return SaveRequest(run.task, load, episodes)
+    return SaveRequest(run.task, load, episodes, kept)
 
 
-def find_episode(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
+def find_episode(
+    history: History, env: int, serial: int | None, before: bool = False, limited: bool = True
+) -> PastEpisode | str:
     """This env's episode that contains the moment `serial`, up to the episode's end; or the reason why it
     cannot be recorded.
 
     Args:
         serial: serial of the moment; None for the running episode or, if it has no step yet, the previous one.
         before: return the previous episode instead.
+        limited: whether the time limit ends the episode.
     """
     if not len(history):
         return "there is no step yet"
-    found = _episode_at(history, env, history.last if serial is None else serial)
+    found = _episode_at(history, env, history.last if serial is None else serial, limited)
     if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
-        found = _episode_before(history, env, found) or found
+        found = _episode_before(history, env, found, limited) or found
     if before and isinstance(found, PastEpisode):
-        found = _episode_before(history, env, found)
+        found = _episode_before(history, env, found, limited)
         while isinstance(found, PastEpisode) and found.steps == 0:  # it was reset at once
-            found = _episode_before(history, env, found)
+            found = _episode_before(history, env, found, limited)
         found = found or "there is no earlier episode in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
         return (
@@ -260,13 +347,15 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
     return found
 
 
-def _episode_before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
+def _episode_before(
+    history: History, env: int, episode: PastEpisode, limited: bool
+) -> PastEpisode | str | None:
     """The previous episode, or the reason why it cannot be recorded; None if it is not in memory."""
     begin = episode.moments[0][0].serial
-    return _episode_at(history, env, begin - 1) if begin > history.first else None
+    return _episode_at(history, env, begin - 1, limited) if begin > history.first else None
 
 
-def _episode_at(history: History, env: int, serial: int) -> PastEpisode | str:
+def _episode_at(history: History, env: int, serial: int, limited: bool) -> PastEpisode | str:
     moments = history.episode(env, serial)
     if not moments:
         return "there is no step yet"
@@ -277,7 +366,7 @@ def _episode_at(history: History, env: int, serial: int) -> PastEpisode | str:
         return "some moments have no snapshot of the task's state, so they cannot be rendered again"
     for count, (moment, at) in enumerate(moments):
         step = moment.as_recorded
-        if count > 0 and (step.terminated[at] or step.truncated[at]):
+        if count > 0 and (step.terminated[at] or (limited and step.truncated[at])):
             moments = moments[: count + 1]
             break
     seed = -1 if first.seeds is None else int(first.seeds[of])

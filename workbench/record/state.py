@@ -14,7 +14,7 @@ from workbench.page.command import Command, Refused
 from workbench.record import saving_state as of_saving
 from workbench.record.commands import ChooseRecordedEnvs, RecordNextEpisode, StopRecording, ToggleRecording
 from workbench.record.gather import Finished
-from workbench.record.saving_state import SaveEffect, SaveStatus, Saving, without_message
+from workbench.record.saving_state import KeptEpisodes, SaveEffect, SaveStatus, Saving, without_message
 from workbench.task.description import Stepped, TaskDescription
 
 DOES: frozenset[type[Command]] = of_saving.DOES | {
@@ -58,6 +58,7 @@ class RecordingStatus:
     problem: str | None = None
     """Reason why the recording ended, or why the last file could not be written."""
     saving: SaveStatus = field(default_factory=SaveStatus)
+    kept: KeptEpisodes = KeptEpisodes()
     chosen: ChosenEnvs = "selected"
     """Envs that a person chose to record and to save."""
 
@@ -115,6 +116,7 @@ class LiveRecording:
             last_file=None if written.last is None else str(written.last.rrd),
             problem=self.problem or written.problem,
             saving=self.saving.status_of(run),
+            kept=self.saving.kept,
             chosen=self.chosen,
         )
 

@@ -72,7 +72,7 @@ def apply(edit: SourceEdit) -> None:
 def revert(edit: SourceEdit) -> None:
     """Undo an applied edit. Raises RefusedEdit if a file was changed since."""
     back = tuple(FileChange(change.file, change.new_text, change.old_text) for change in edit.changes)
-    _replace_all(back, "since the camera was written into it")
+    _replace_all(back, "since the change was written into it")
 
 
 def check_own(path: str) -> None:

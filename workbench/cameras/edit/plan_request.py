@@ -32,7 +32,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, r
     text = "" if placed is None else snippet(request.result[1], placed)
     owner_text = "" if request.what == "add" or info is None else _owner_text(task, info)
     try:
-        texts = _texts(task)
+        texts = texts_on_disk(task)
         if owner_text and info is not None:
             edit = _override_edit(task, texts, info, request, owner_text, run)
         elif not task.source_files:
@@ -160,7 +160,7 @@ def _own_edit(
     return plan_edit(texts, request.key, info.settings, request.settings, run)
 
 
-def _texts(task: TaskDescription) -> dict[str, str]:
+def texts_on_disk(task: TaskDescription) -> dict[str, str]:
     """The author's files on disk, with their own line endings. Raises RefusedEdit."""
     texts: dict[str, str] = {}
     for path in task.source_files:

@@ -78,14 +78,21 @@ def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> No
         if not _look_at(changes, pose, after):
             _as_quaternion(changes, pose, after)
         return
-    _position(changes, pose, after.position)
-    quaternion = pose.numbers[3:]
-    if angle_between(quaternion, after.quaternion) <= ANGLE_STEP_RADIANS / 10:
+    write_pq(changes, pose, after.position, after.quaternion)
+
+
+def write_pq(
+    changes: Changes, pose: TracedValue, position: Sequence[float], quaternion: Sequence[float]
+) -> None:
+    """Edit a call of ``Pose`` to this position in metres and orientation wxyz."""
+    _position(changes, pose, position)
+    before = pose.numbers[3:]
+    if angle_between(before, quaternion) <= ANGLE_STEP_RADIANS / 10:
         return
     part = pose.parts.get("q")
-    if part is not None and part.function and _euler(changes, part, after):
+    if part is not None and part.function and _euler(changes, part, quaternion):
         return
-    texts = quaternion_texts(same_side(after.quaternion, quaternion))
+    texts = quaternion_texts(same_side(quaternion, before))
     if part is None:
         changes.added.setdefault(pose, []).append(f"q=[{', '.join(texts)}]")
     elif part.literal and part.parts:
@@ -259,14 +266,14 @@ def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float
     return best[0], best[1], best[2]
 
 
-def _euler(changes: Changes, part: TracedValue, after: CameraSettings) -> bool:
+def _euler(changes: Changes, part: TracedValue, quaternion: Sequence[float]) -> bool:
     items = [part.parts[name] for name in ("ai", "aj", "ak")]
-    requested = to_euler(after.quaternion, [item.numbers[0] for item in items])
+    requested = to_euler(quaternion, [item.numbers[0] for item in items])
     for decimals in (4, 5, 6):
         roll, pitch, yaw = (
             written_value(item, w, decimals) for item, w in zip(items, requested, strict=True)
         )
-        if _turned(euler2quat(roll, pitch, yaw), after) <= ANGLE_STEP_RADIANS:
+        if angle_between(euler2quat(roll, pitch, yaw), quaternion) <= ANGLE_STEP_RADIANS:
             for item, w in zip(items, requested, strict=True):
                 changes.number(item, w, decimals)
             return True

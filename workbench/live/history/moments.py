@@ -467,6 +467,15 @@ class History:
             if jumped and moment.restored is None:
                 return
 
+    def by_hand(self, moment: Moment, env: int) -> bool:
+        """Whether a person moved or pulled a body in this env's episode up to a moment."""
+        for earlier, at in self._moments_back(env, moment.serial):
+            if earlier.event_flags[at] & BY_HAND:
+                return True
+            if earlier.jumped.any() and earlier.restored is None:
+                break
+        return False
+
     def replay_path(self, env: int, serial: int, most: int) -> ReplayPath | None:
         """Replay path of this env from the last exact point to a moment; None if unknown or longer than `most` steps.
 

@@ -361,7 +361,7 @@ def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snaps
     """The snapshot to restore after the build; None for a new episode."""
     if request.snapshot is not None:
         return pickle.loads(request.snapshot)
-    if running is None or running.opened.loaded.chosen != loaded.chosen:
+    if running is None or request.fresh or running.opened.loaded.chosen != loaded.chosen:
         return None
     if changed_options(running.request.options, request.options):
         return None  # envs with other options must start from a reset

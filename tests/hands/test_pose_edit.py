@@ -1,0 +1,161 @@
+"""Where a body was moved is written into the author's file: planned, run, saved, checked and reverted in a session."""
+
+# A session that has a task has a step.
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import TASKS, jump, live_session, runs, start_over, wait_until
+from workbench.app.session import Session
+from workbench.hands.commands import DropPoseChange, RevertPoseChange, SavePoseChange
+from workbench.hands.pose_edit import PoseEdit, PoseWanted
+from workbench.hands.state import BodyMoved
+from workbench.live.commands import PauseRun, PlayRun
+from workbench.page.command import Refused
+
+THERE = (0.12, -0.2, 0.03, 0.9238795, 0.0, 0.0, 0.3826834)
+MINIMAL = (TASKS / "minimal.py").read_text()
+RESET_LINES = [
+    line + "\n"
+    for line in MINIMAL.splitlines()
+    if line.strip().startswith(("p = torch", "self.cube.set_pose"))
+]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("task") / "minimal.py"
+    file.write_text(MINIMAL)
+    return file
+
+
+@pytest.fixture(scope="module")
+def session(child_process: None, file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    with live_session(file, tmp_path_factory.mktemp("recordings")) as session:
+        yield session
+
+
+@pytest.fixture
+def opened(session: Session, file: Path) -> Session:
+    """The session with the original file, paused."""
+    session.do(DropPoseChange())
+    session.do(PauseRun())
+    if file.read_text() != MINIMAL:
+        file.write_text(MINIMAL)
+    runs(session, MINIMAL)
+    return session
+
+
+def load(session: Session, file: Path, text: str) -> None:
+    file.write_text(text)
+    runs(session, text)
+
+
+def edit(session: Session, *stages: str) -> PoseEdit:
+    return wait_until(session, lambda v: v.of(PoseEdit).stage in stages, " or ".join(stages)).of(PoseEdit)
+
+
+def want(session: Session) -> PoseEdit:
+    """Move the cube, ask to write its pose, and wait for the plan."""
+    jump(session, lambda: session.happen(BodyMoved("cube", (0, 1), THERE)))
+    session.happen(PoseWanted("cube", THERE))
+    return edit(session, "planned", "refused")
+
+
+def first_poses(session: Session, seed: int) -> np.ndarray:
+    """(N, 7) of the cube after a reset."""
+    step = start_over(session, seed).step
+    return step.poses[:, session.view().task.geometry.body_names.index("cube")]
+
+
+def changed_lines(old: str, new: str) -> list[str]:
+    return [line for line in difflib.ndiff(old.splitlines(), new.splitlines()) if line[0] in "+-"]
+
+
+def test_a_pose_of_each_reset_is_shown_saved_checked_and_reverted(opened: Session, file: Path) -> None:
+    planned = want(opened)
+    assert planned.stage == "planned", planned.message
+    assert file.read_text() == MINIMAL, "nothing is written yet"
+    opened.do(SavePoseChange())
+    done = edit(opened, "checked", "mismatch", "refused")
+    assert done.stage == "checked", done.message
+    assert changed_lines(MINIMAL, file.read_text()) == [
+        "-         p = torch.tensor([0, 0, 0.03], device=self.device).repeat(len(env_idx), 1)",
+        "+         p = torch.tensor([0.12, -0.2, 0.03], device=self.device).repeat(len(env_idx), 1)",
+        "-         self.cube.set_pose(Pose.create_from_pq(p=p))",
+        "+         self.cube.set_pose(Pose.create_from_pq(p=p, q=[0.9238795, 0.0, 0.0, 0.3826834]))",
+    ]
+    np.testing.assert_allclose(first_poses(opened, 7), [THERE, THERE], atol=1e-4)
+    opened.do(RevertPoseChange())
+    wait_until(
+        opened, lambda v: v.of(PoseEdit).stage == "undone" and not v.of(PoseEdit).writing, "the old text"
+    )
+    assert file.read_text() == MINIMAL
+
+
+def test_a_builders_pose_is_written_where_no_reset_sets_another(opened: Session, file: Path) -> None:
+    text = MINIMAL
+    for line in RESET_LINES:
+        text = text.replace(line, "")
+    load(opened, file, text)
+    planned = want(opened)
+    assert planned.stage == "planned", planned.message
+    opened.do(SavePoseChange())
+    assert edit(opened, "checked", "mismatch").stage == "checked"
+    assert [line.strip("+- ") for line in changed_lines(text, file.read_text())] == [
+        "builder.initial_pose = sapien.Pose(p=[0, 0, 0.03])",
+        "builder.initial_pose = sapien.Pose(p=[0.12, -0.2, 0.03], q=[0.9238795, 0.0, 0.0, 0.3826834])",
+    ]
+
+
+def test_a_text_whose_run_does_not_give_the_pose_is_refused(opened: Session, file: Path) -> None:
+    moved = (
+        "        for body in [self.cube]:\n            body.set_pose(Pose.create_from_pq(p=[FAR, 0, 0.03]))\n"
+    )
+    text = MINIMAL.replace("p=[0, 0, 0.03])\n", "p=[FAR, 0, 0.03])\n").replace(
+        "\n@register_env", "\nFAR = 0.3\n\n\n@register_env", 1
+    )
+    for line in RESET_LINES:
+        text = text.replace(line, moved)
+        moved = ""
+    load(opened, file, text)
+    planned = want(opened)
+    assert planned.stage == "refused" and "a run of the changed file shows" in planned.message
+    assert "sapien.Pose(p=[0.12, -0.2, 0.03]" in planned.snippet
+    assert file.read_text() == text
+
+
+def test_a_random_pose_is_refused(opened: Session, file: Path) -> None:
+    text = MINIMAL.replace(
+        "torch.tensor([0, 0, 0.03], device=self.device).repeat(len(env_idx), 1)",
+        "torch.rand((len(env_idx), 3))",
+    )
+    assert text != MINIMAL
+    load(opened, file, text)
+    planned = want(opened)
+    assert planned.stage == "refused" and "in each episode" in planned.message and "0.12" in planned.snippet
+
+
+def test_an_edit_that_the_author_made_meanwhile_is_not_overwritten(opened: Session, file: Path) -> None:
+    assert want(opened).stage == "planned"
+    load(opened, file, MINIMAL + "# mine\n")
+    opened.do(SavePoseChange())
+    done = edit(opened, "refused")
+    assert "edited since" in done.message and file.read_text() == MINIMAL + "# mine\n"
+
+
+def test_what_was_not_read_is_not_saved_and_a_running_body_is_not_written(opened: Session) -> None:
+    for command in (SavePoseChange(), RevertPoseChange()):
+        with pytest.raises(Refused):
+            opened.do(command)
+    opened.do(PlayRun())
+    with pytest.raises(Refused, match="Pause"):
+        opened.happen(PoseWanted("cube", THERE))
+    opened.do(PauseRun())
