@@ -8,16 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.drive.hands import OFFSET, Hands
 from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
-from tests.hands.test_panel import Hands
 from workbench.hands.commands import FrameBody, HideBody, MeasureFrom, ShowHiddenBodies, TrackBody
 from workbench.hands.look import BodyView
 from workbench.live.commands import FindBodies, SelectBody
 from workbench.page.command import Refused
-
-OFFSET = np.array([5.0, 0.0, 0.0])
 
 
 @dataclass

@@ -7,48 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.drive.live import Live, StubSession
+from tests.drive.hands import OFFSET, PAGE, Hands
+from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.drive.scenes import changed, running
 from workbench.hands.commands import ChooseMovedEnvs, SetBodyPosition, ToggleHandles
-from workbench.hands.panel import HandsPanel
 from workbench.hands.state import BodyMoved, BodyPulled
 from workbench.hands.state import Hands as State
 from workbench.live.commands import SelectBody
 from workbench.live.messages import PullBody
 from workbench.page.command import Refused
-
-OFFSET = np.array([5.0, 0.0, 0.0])
-MIDDLE = np.zeros(3)
-PAGE = 3
-
-
-class Hands:
-    """A panel on its own, with `body` selected in env 1 of 3."""
-
-    def __init__(self, panels: Panels, body: str = "cube", playing: bool = False) -> None:
-        self.session = StubSession()
-        self.panel = HandsPanel(panels.server, self.session, lambda: body)  # type: ignore[arg-type]
-        self.view = replace(running(3, selected_env=1), playing=playing)
-        assert self.view.task is not None and self.view.step is not None
-        self.session.shown, self.poses = self.view, self.view.step.poses
-        self.geometry = self.view.task.geometry
-        self.pose = self.poses[1, self.geometry.body_names.index(body)]
-        self.redraw()
-
-    def redraw(self) -> np.ndarray:
-        """Draw; returns the poses as drawn."""
-        moved = self.panel.moved(self.geometry, self.poses)
-        self.panel.draw_in_view(self.view, moved, OFFSET)
-        self.panel.draw(self.view)
-        return moved
-
-    def drag(self, *ends: np.ndarray, grabbed: np.ndarray = MIDDLE) -> None:
-        """Drag from `grabbed` (relative to the body's origin) over points of the env's frame."""
-        start = self.pose[:3] + grabbed + OFFSET
-        phases = ["start", *["update"] * (len(ends) - 1)]
-        for phase, end in zip(phases, ends, strict=True):
-            self.panel.drag(PAGE, phase, start, end + OFFSET)  # type: ignore[arg-type]
 
 
 def test_a_paused_body_follows_the_pointer_and_is_moved_at_the_end(panels: Panels) -> None:

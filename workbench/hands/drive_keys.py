@@ -68,7 +68,7 @@ def driven_action(
             moves an end effector in this direction, away from the person.
     """
     bound = bindings(dimensions)
-    held = [(one.raises in keys) - (one.lowers in keys) for one in bound]
+    held = [SHARE * ((one.raises in keys) - (one.lowers in keys)) for one in bound]
     both = [key + stick for key, stick in zip_longest(held, sticks[: len(bound)], fillvalue=0.0)]
     amounts = np.clip(np.array(both, float), -1.0, 1.0)
     axes = [one.name.rpartition("/")[2] for one in bound[:2]]
@@ -77,7 +77,7 @@ def driven_action(
         cos, sin = np.cos(yaw), np.sin(yaw)
         amounts[:2] = cos * ahead - sin * left, sin * ahead + cos * left
     values = [
-        SHARE * min(abs(amount), 1.0) * (one.high if amount > 0 else one.low)
+        min(abs(amount), 1.0) * (one.high if amount > 0 else one.low)
         for amount, one in zip(amounts, bound, strict=True)
     ]
     return tuple(one.dimension for one in bound), tuple(map(float, values))
