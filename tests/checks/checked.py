@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import linecache
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from workbench.checks import run_rules as run
 from workbench.checks.evidence.collect import Checkup
+from workbench.checks.evidence.rolled_episodes import Actor
 from workbench.checks.results import RuleResult, by_rule
 from workbench.checks.rule_table import RULES, gpu_rules_of
 from workbench.envs.gpu_rules import Finding
@@ -61,12 +62,17 @@ def check_rule(rule: str, reference: str, num_envs: int, seeds: int, **env_kwarg
 
 
 def check_rules(
-    rules: Collection[str], reference: str, num_envs: int, seeds: int, **env_kwargs: Any
+    rules: Collection[str],
+    reference: str,
+    num_envs: int,
+    seeds: int,
+    actors: Sequence[Actor] = (),
+    **env_kwargs: Any,
 ) -> dict[str, RuleResult]:
     """The results of these rules on a task file or an id."""
     degrees = dict.fromkeys(RULES, "off") | {rule: RULES[rule].degree for rule in rules}
     loaded = load_task(reference)
-    checkup = Checkup(loaded, env_kwargs, num_envs=num_envs, seeds=seeds)
+    checkup = Checkup(loaded, env_kwargs, num_envs=num_envs, seeds=seeds, actors=actors)
     try:
         return by_rule(results_of(checkup, degrees))
     finally:

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.checks.checked import Checked, check_rule, the_finding
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
+from workbench.task.problem import Problem, TaskError
 
 pytestmark = pytest.mark.thorough
 
@@ -55,6 +62,25 @@ def test_an_entry_that_is_nan(checked: Checked) -> None:
         "'cube_height' is not finite in 8 of 8 random episodes, first at step 0 of seed 0" in finding.message
     )
     assert finding.code.startswith('"cube_height"') and finding.degree == "warn"
+
+
+class Raises:
+    """An actor whose policy raises before its first step."""
+
+    kind, seeds, lengths = "given", (0, 1), (5, 5)
+
+    def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
+        raise TaskError(Problem("policy", "no such joint", "policy.py", 3, "act()", ""))
+
+    def next_action(self, task: TaskEnv, step: int) -> NDArray[np.float32]:
+        raise AssertionError("no episode begins")
+
+
+def test_a_breach_that_was_found_before_a_policy_raised_counts(checked: Checked) -> None:
+    edit = '"cube_height": height', '"cube_height": torch.log(height - 1)'
+    result = checked("entries-finite", edit, num_envs=2, seeds=2, actors=[Raises()])
+    assert "not finite in 2 of 2 random episodes" in the_finding(result).message
+    assert result.problem is not None and result.problem.message == "no such joint"
 
 
 def test_success_and_fail_together(checked: Checked) -> None:

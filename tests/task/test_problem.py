@@ -151,6 +151,12 @@ def test_a_library_error_caused_by_the_authors_code_has_the_authors_line(task: L
     )
 
 
+def test_where_no_author_line_ran_the_message_names_the_line_that_raised() -> None:
+    call = of_a_library("def inner(): raise OSError('no device')\n\n\ndef outer(): inner()")
+    problem = caught(call, ())
+    assert problem.message.endswith("(raised at /x/site-packages/library.py:1)")
+
+
 def test_where_no_author_line_ran_the_hook_with_the_wrong_result_is_blamed(task: LoadedTask) -> None:
     env = task.cls()
 
