@@ -46,7 +46,7 @@ def test_ground_truth_in_a_mode_with_pictures(checked: Checked, renderer: None) 
 
 
 def test_noise_in_an_observation_follows_no_body(checked: Checked, renderer: None) -> None:
-    edit = GOAL, f'{GOAL} "noise": torch.rand((self.num_envs, 1), device=self.device),'
+    edit = GOAL, f'{GOAL} "noise": torch.from_numpy(np.random.default_rng().random((self.num_envs, 1))),'
     assert checked("ground-truth", edit).state == "kept"
 
 

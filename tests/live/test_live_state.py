@@ -285,13 +285,6 @@ def test_pictures_are_of_the_selected_env_and_the_shown_moment(
     )
 
 
-def test_a_seed_that_is_chosen_while_a_version_loads_stays_chosen(fake: FakeWorkerSession) -> None:
-    fake.load(options=TaskOptions(3, seed=0))
-    fake.session.do(SetSeed(seed=7))
-    fake.load("rebuilt", options=TaskOptions(3, seed=0))
-    assert fake.view.seed == 7
-
-
 def test_the_version_that_ran_is_restored_even_if_another_class_was_requested(tmp_path: Path) -> None:
     file = str(tmp_path / "push.py")
     found = {

@@ -232,7 +232,7 @@ def _take_options(run: Run, loaded: TaskOptions | None) -> Run:
     taken = run.tried_options is not None and not changed_options(run.tried_options, loaded)
     return replace(
         run,
-        options=replace(loaded, seed=run.options.seed),
+        options=loaded,
         tried_options=None if taken else run.tried_options,
     )
 
