@@ -59,3 +59,25 @@ def test_held_keys_drive_the_hand_and_stop_gives_back(desk: Desk) -> None:
     sign.get_by_role("button", name="stop").click()
     expect(sign).to_be_hidden()
     desk.button("Pause").click()
+
+
+def test_a_dragged_slider_sets_its_joint_once_and_undo_takes_it_back(desk: Desk) -> None:
+    desk.tab("Run")
+    page = desk.page
+    page.locator("[data-fold='Joints']").click()
+    slider = page.locator("input[type=range][name$='panda.0']")
+    number = page.locator("input[type=text][name$='panda.0']")
+    expect(slider).to_be_visible()
+    before = number.input_value()
+    box = slider.bounding_box()
+    assert box is not None
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + box["width"] / 2, y)
+    page.mouse.down()
+    for share in (0.6, 0.7, 0.8):
+        page.mouse.move(box["x"] + share * box["width"], y)
+    page.mouse.up()
+    until(lambda: float(number.input_value()) > 80, "the joint to follow")
+    expect(page.locator(".wb-status")).to_contain_text("paused")
+    desk.press("Shift+U")
+    until(lambda: number.input_value() == before, "the joint to return")

@@ -21,11 +21,13 @@ from tests.gpu.conftest import Simulation
 from workbench.envs import action_vector as actions
 from workbench.envs.assets import MissingAssets
 from workbench.envs.inspect_env import list_contacts
+from workbench.envs.read_robots import read_robots
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
-from workbench.hands.worker import Hand, move_body
-from workbench.live.messages import MoveBody, PullBody
+from workbench.hands.link_poses import link_poses
+from workbench.hands.worker import Hand, move_body, move_joints
+from workbench.live.messages import MoveBody, MoveJoints, PullBody
 
 N = 4
 SEEDS = [40, 41, 42, 43]
@@ -138,6 +140,24 @@ def test_a_hand_moves_and_pulls_a_body_of_one_env(picks: tuple[TaskEnv, TaskEnv]
     with hand.pulling(env.env):
         env.step(None)
     assert hand.pulled is None
+
+
+def test_joints_are_set_in_one_env_and_stay_there(picks: tuple[TaskEnv, TaskEnv]) -> None:
+    env, _ = picks
+    before = env.reset(seed=SEEDS)
+    request = MoveJoints("panda", (1,), (0, 3), (0.5, -1.5), None, "", 0)
+    moved = move_joints(env, request)
+    assert moved is not None and before.qpos is not None and moved[0].qpos is not None
+    np.testing.assert_allclose(moved[0].qpos[1, [0, 3]], [0.5, -1.5], atol=1e-5)
+    np.testing.assert_allclose(moved[0].qpos[[0, 2, 3]], before.qpos[[0, 2, 3]], atol=1e-5)
+    (robot,) = read_robots(env.env)
+    placed = link_poses(robot, before.poses[1:2], moved[0].qpos[1:2])[0]
+    links = [link.body for link in robot.links]
+    np.testing.assert_allclose(moved[0].poses[1, links, :3], placed[links, :3], atol=1e-4)
+    for _ in range(5):
+        step = env.step(actions.hold_action(env.parts, N))
+    assert step.qpos is not None  # pyright: ignore
+    np.testing.assert_allclose(step.qpos[1, [0, 3]], [0.5, -1.5], atol=0.01)  # pyright: ignore
 
 
 def test_a_snapshot_restores_the_chosen_envs_and_leaves_the_others(picks: tuple[TaskEnv, TaskEnv]) -> None:

@@ -15,7 +15,7 @@ from tests.drive.scenes import changed, running
 from workbench.envs.keywords import HowMade, Keyword
 from workbench.envs.robots import Joint, JointTarget, Robot, RobotKeyframe, RobotLink
 from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe
-from workbench.hands.joints_panel import PAST, TITLE, with_dragged_joint
+from workbench.hands.joints_panel import PAST, TITLE, short_names, with_dragged_joint
 from workbench.hands.state import DraggedJoint, Hands
 from workbench.live.view import SessionView
 from workbench.page.commands import TellUnfolded
@@ -51,11 +51,11 @@ def unfold(live: Live, view: SessionView) -> Panels:
     return live.part("Run")
 
 
-def test_the_fold_names_the_robot_and_is_empty_until_it_is_unfolded(live_page: Live) -> None:
+def test_the_fold_says_how_many_joints_there_are_and_is_empty_until_it_is_unfolded(live_page: Live) -> None:
     live_page.show(view_of())
     assert not [label for label in live_page.folders() if label.startswith(TITLE)]
     live_page.show(replace(view_of(ARM), task_serial=2))
-    assert f"{TITLE} \N{MIDDLE DOT} arm" in live_page.folders()
+    assert f"{TITLE} \N{MIDDLE DOT} 2" in live_page.folders()
     assert not live_page.part("Run").shows("lift")
 
 
@@ -72,6 +72,20 @@ def test_the_sliders_of_several_robots_are_named_by_the_robot(live_page: Live) -
     run = unfold(live_page, view_of(ARM, other))
     assert f"{TITLE} \N{MIDDLE DOT} 2 robots" in live_page.folders()
     assert "<b>arm</b>" in run.html() and "<b>other</b>" in run.html()
+
+
+@pytest.mark.parametrize(
+    ("names", "short"),
+    [
+        (["panda_joint1", "panda_finger_joint1"], ["joint1", "finger_joint1"]),
+        (["left_hip_joint", "torso_joint"], ["left_hip", "torso"]),
+        (["joint_f1_0", "joint_f2_0"], ["f1", "f2"]),
+        (["hinge_1"], ["hinge_1"]),
+        (["slider"], ["slider"]),
+    ],
+)
+def test_names_leave_out_the_words_that_all_joints_share(names: list[str], short: list[str]) -> None:
+    assert short_names(Joint(name, False, -1.0, 1.0, 0) for name in names) == short
 
 
 def test_a_slider_drags_and_sets_its_joint(live_page: Live) -> None:

@@ -40,7 +40,7 @@ def limits_text(joint: Joint) -> str:
     unit = " m" if joint.prismatic else "°"
     if math.isinf(low) and math.isinf(high):
         return f"no limits, {unit.strip()}"
-    return f"{low:g} to {high:g}{unit}"
+    return f"{low:.3g} to {high:.3g}{unit}"
 
 
 def qpos_code(qpos: Sequence[float] | Floats) -> str:

@@ -78,7 +78,8 @@ class JointsPanel(PagePart[SessionView]):
         self._fold.visible = bool(robots)
         if not robots:
             return
-        name_fold(self._fold, TITLE, robots[0].name if len(robots) == 1 else f"{len(robots)} robots")
+        count = sum(len(robot.joints) for robot in robots)
+        name_fold(self._fold, TITLE, f"{len(robots)} robots" if len(robots) > 1 else str(count))
         if not self._unfolded:
             return
         if robots != self._robots:
@@ -164,11 +165,14 @@ def note_of(view: SessionView) -> str:
 
 
 def short_names(joints: Iterable[Joint]) -> list[str]:
-    """The joints' names without the words with which all of them begin."""
+    """The joints' names without the words with which all of them begin or end."""
     names = [joint.name for joint in joints]
-    prefix = os.path.commonprefix(names)
-    start = prefix.rfind("_") + 1
-    return [name[start:] for name in names]
+    if len(names) == 1:
+        return names
+    start = os.path.commonprefix(names).rfind("_") + 1
+    backwards = [name[start:][::-1] for name in names]
+    end = os.path.commonprefix(backwards).rfind("_") + 1
+    return [name[end:][::-1] for name in backwards]
 
 
 def shown_position(view: SessionView, robot: Robot, number: int) -> float:
