@@ -10,7 +10,7 @@ from typing import Any
 from workbench.commands import COMMANDS
 from workbench.page.command import Command
 
-_VOID = {"input", "br", "hr", "img", "meta"}
+_VOID = {"input", "br", "wbr", "hr", "img", "meta"}
 
 
 @dataclass
