@@ -1,4 +1,4 @@
-"""Driving with the real keyboard in a real Chromium."""
+"""Driving with the real keyboard, and with a gamepad that the browser reports, in a real Chromium."""
 
 from __future__ import annotations
 
@@ -81,3 +81,35 @@ def test_a_dragged_slider_sets_its_joint_once_and_undo_takes_it_back(desk: Desk)
     expect(page.locator(".wb-status")).to_contain_text("paused")
     desk.press("Shift+U")
     until(lambda: number.input_value() == before, "the joint to return")
+
+
+PAD = """
+window.pad = { connected: true, mapping: "standard", axes: [0, 0, 0, 0], buttons: Array.from({ length: 17 }, () => ({ value: 0 })) };
+navigator.getGamepads = () => [null, window.pad];
+"""
+
+
+def test_a_gamepad_moves_the_hand_only_while_a_person_drives(desk: Desk) -> None:
+    page = desk.page
+    desk.tab("Run")
+    choose(desk, "Source", "hold still", of="choose_actions")
+    select(desk, "panda/panda_hand")
+    page.wait_for_timeout(1000)
+    before = position(desk)[2]
+    page.evaluate(PAD)
+    page.evaluate("pad.axes[3] = -1")
+    page.wait_for_timeout(1000)
+    assert position(desk)[2] == pytest.approx(before, abs=0.005), "nobody drives"
+    desk.press("k")
+    until(lambda: position(desk)[2] > before + 0.03, "the hand to rise")
+    page.evaluate("pad.axes[3] = 0")
+    page.wait_for_timeout(1000)
+    height = position(desk)[2]
+    page.wait_for_timeout(700)
+    assert position(desk)[2] == pytest.approx(height, abs=0.005), "a released stick holds still"
+    desk.tab("Run")
+    expect(page.get_by_text("gamepad connected")).to_be_visible()
+    page.evaluate("navigator.getGamepads = () => []")
+    expect(page.get_by_text("gamepad connected")).to_be_hidden()
+    desk.press("k")
+    expect(page.locator(".wb-drives")).to_be_hidden()

@@ -266,7 +266,7 @@ EVERY_REPLY = {
         f"{feature}=()"
         for feature in (
             *("accelerometer", "autoplay", "browsing-topics", "camera", "display-capture", "encrypted-media"),
-            *("gamepad", "geolocation", "gyroscope", "hid", "identity-credentials-get", "idle-detection"),
+            *("geolocation", "gyroscope", "hid", "identity-credentials-get", "idle-detection"),
             *("local-fonts", "magnetometer", "microphone", "midi", "payment", "picture-in-picture"),
             *(
                 "publickey-credentials-get",
@@ -278,11 +278,11 @@ EVERY_REPLY = {
             ),
         )
     )
-    + ", clipboard-write=(self), fullscreen=(self)",
+    + ", clipboard-write=(self), fullscreen=(self), gamepad=(self)",
     "Connection": "close",
 }
 """Headers of every reply, including refusals: no MIME sniffing, no referrer, no framing, opening or embedding by other
-sites, no devices."""
+sites, no devices but gamepads."""
 PAGE_OF_OURS = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'",
