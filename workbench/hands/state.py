@@ -353,7 +353,11 @@ def _set_joint(hands: Hands, run: Run, name: str, number: int, to: float, ends: 
     joint, envs = robot.joints[number], _envs_of_move(hands, run)
     position = position_of(joint, to)
     if run.playing:
-        return hands, _drive_joint(run, joint, envs, position)
+        driven = _drive_joint(run, joint, envs, position)
+        for env in envs:  # the slider takes the arm out of the handles
+            driven += of_reach.let_go(hands.reach, env)
+            hands = replace(hands, reach=of_reach.without(hands.reach, env))
+        return hands, driven
     hands = replace(hands, dragged=DraggedJoint(name, envs, number, position))
     if not ends:
         return hands, []
