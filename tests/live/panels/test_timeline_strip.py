@@ -131,5 +131,7 @@ def test_an_event_that_lasts_several_steps_has_one_mark() -> None:
         (53.0, "success"),
         (60.0, "limit"),
     ]
+    resets, _ = strip_html(strip(events=((150, RESET), (151, RESET))), running(4, timeline=past()))
+    assert [place for place, _, _ in marks(resets)] == [50.0, 51.0]
     constant, _ = strip_html(strip(values=np.full(101, 0.5, np.float32)), running(4, timeline=past()))
     assert constant.count(">0.5<") == 1

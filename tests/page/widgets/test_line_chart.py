@@ -34,6 +34,11 @@ def test_larger_numbers_are_higher_and_later_steps_further_right() -> None:
     assert 'points="0,100 50,50 100,0"' in html, "y runs down in SVG"
 
 
+def test_the_legend_of_a_step_without_a_value_has_a_dash() -> None:
+    (chart,) = charts_in(chart_html("reward", X, LINES, at=1.0))
+    assert chart.legend == (("one", "—"),)
+
+
 def test_a_press_sends_the_step_under_it() -> None:
     html = chart_html(
         "reward", np.arange(5, 55), [ChartLine("one", np.arange(50.0))], press=lambda k: Seek(step=k)

@@ -353,6 +353,8 @@ NAMES = {
     "other": "other event",
 }
 """Legend text of each style."""
+LASTING = REWARD_NONFINITE | FAIL | SUCCESS | TRUNCATED
+"""Events that hold in each of several steps, if the episode continues."""
 MAX_MARKS = 250
 """Maximum number of marks on the strip: closer marks could not be distinguished."""
 
@@ -386,7 +388,7 @@ def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
     marks: dict[int, tuple[int, int, str]] = {}
     for tick, flags in strip.events:
         flag = next(flag for flag in rank if flags & flag)
-        if flags == events.get(tick - 1):
+        if flags == events.get(tick - 1) and not flags & ~LASTING:
             continue
         place = MAX_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
         if place not in marks or rank.index(flag) < rank.index(marks[place][1]):

@@ -111,7 +111,7 @@ def chart_html(
         height=height,
         lines=[(line, _polylines(line.values, x, across, down)) for line in lines],
         legend=[
-            (line, "" if place is None else number_text(float(line.values[place]), ".3g"))
+            (line, "" if place is None else _value_text(float(line.values[place])))
             for line in lines
             if line.name
         ],
@@ -121,6 +121,11 @@ def chart_html(
         press=None if press is None else press(round(first)),
         ends=(round(first), round(last)),
     )
+
+
+def _value_text(value: float) -> str:
+    """A step without a value is NaN in a line."""
+    return "—" if np.isnan(value) else number_text(value, ".3g")
 
 
 def _span_of_all(lines: Sequence[ChartLine]) -> Span:
