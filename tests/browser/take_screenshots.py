@@ -318,6 +318,20 @@ def shoot_solve(browser: Browser) -> None:
         desk.shoot("solve")
 
 
+def shoot_hands(browser: Browser) -> None:
+    """The cube is selected, with the handles that move it."""
+    with live_page(browser, "--num-envs", "4") as desk:
+        desk.step(5)
+        desk.press("Control+k")
+        desk.page.keyboard.type("Body cube")
+        expect(desk.page.locator(".mantine-Spotlight-action").first).to_contain_text("Body cube")
+        desk.page.keyboard.press("Enter")
+        desk.tab("Inspect")
+        expect(desk.page.get_by_text("centre of mass")).to_be_visible()
+        desk.press("m")
+        desk.shoot("hands")
+
+
 def shoot_busy(browser: Browser) -> None:
     """An infinite loop in the reward of a new version."""
     lines = TASK.read_text().splitlines()
@@ -446,6 +460,7 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "measured_camera": shoot_measured_camera,
     "branch": shoot_branch,
     "rescored": shoot_rescored,
+    "hands": shoot_hands,
     "busy": shoot_busy,
     "checks": shoot_checks,
     "solve": shoot_solve,
