@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,30 @@ from tests.drive.hands import OFFSET, PAGE, Hands
 from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.drive.scenes import changed, running
-from workbench.hands.commands import ChooseMovedEnvs, SetBodyPosition, ToggleHandles
+from workbench.hands.commands import (
+    BeginAgain,
+    ChooseMovedEnvs,
+    DiscardEpisode,
+    KeepEpisode,
+    SetBodyPosition,
+    ToggleHandles,
+    WriteBodyPose,
+)
+from workbench.hands.pose_edit import PoseEdit, PoseWanted
 from workbench.hands.state import BodyMoved, BodyPulled
 from workbench.hands.state import Hands as State
 from workbench.live.commands import SelectBody
 from workbench.live.messages import PullBody
 from workbench.page.command import Refused
+from workbench.record.saving_state import KeptEpisodes
+from workbench.record.state import RecordingStatus
+from workbench.task.description import ActionDimension
+from workbench.task.write_edits import SourceEdit
+
+
+def words_of(html: str) -> str:
+    """The text of some HTML, with single spaces."""
+    return " ".join(re.sub("<[^>]*>", "", html).split())
 
 
 def test_a_paused_body_follows_the_pointer_and_is_moved_at_the_end(panels: Panels) -> None:
@@ -118,3 +137,32 @@ def test_only_what_a_drag_would_move_takes_the_gesture_from_the_view(
 ) -> None:
     Hands(panels, body, playing)
     assert bool(panels.nodes("/hands/grip")) == draggable
+
+
+def test_a_driver_sees_the_keys_and_the_set_and_ends_episodes_by_buttons(live_page: Live) -> None:
+    hands = State(driving=True, note="The episode of seed 3 (40 steps) is kept, with success.")
+    recording = RecordingStatus(kept=KeptEpisodes(2, 1, 1))
+    view = running(2)
+    assert view.task is not None
+    task = replace(view.task, actions=(ActionDimension("arm/x", -1.0, 1.0),))
+    live_page.show(replace(view, task=task, features={State: hands, RecordingStatus: recording}))
+    text = words_of(live_page.part("Run").html())
+    for words in ("seed 3 (40 steps) is kept", "2 kept, 1 with success, 1 being saved", "W / S", "arm/x"):
+        assert words in text
+    for command in (KeepEpisode(), DiscardEpisode(), BeginAgain()):
+        live_page.do(command)
+    assert live_page.asked[-3:] == [KeepEpisode(), DiscardEpisode(), BeginAgain()]
+
+
+def test_a_planned_pose_is_shown_as_a_diff_and_saved_by_its_button(live_page: Live) -> None:
+    change = SourceEdit("/tasks/push.py", "a\np = [0, 0, 0]\n", "a\np = [0.1, 0, 0]\n", ("goal too",), None)
+    edit = PoseEdit("planned", 1, "cube", edit=change, message="This writes where cube begins.")
+    view = running(3, selected_env=1)
+    live_page.do(SelectBody(body="cube"))
+    live_page.show(replace(view, playing=False, features={PoseEdit: edit}))
+    text = words_of(live_page.part("Inspect").html())
+    for words in ("Write into the file", "p = [0.1, 0, 0]", "goal too", "Save to push.py"):
+        assert words in text
+    live_page.do(WriteBodyPose())
+    wanted = live_page.asked[-1]
+    assert isinstance(wanted, PoseWanted) and wanted.body == "cube" and len(wanted.pose) == 7
