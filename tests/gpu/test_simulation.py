@@ -19,6 +19,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.gpu.conftest import Simulation
 from workbench.envs import action_vector as actions
+from workbench.envs.arms import find_arms
 from workbench.envs.assets import MissingAssets
 from workbench.envs.inspect_env import list_contacts
 from workbench.envs.read_robots import read_robots
@@ -26,8 +27,9 @@ from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 from workbench.hands.link_poses import link_poses
+from workbench.hands.reach_worker import LedArms, set_arm
 from workbench.hands.worker import Hand, move_body, move_joints
-from workbench.live.messages import MoveBody, MoveJoints, PullBody
+from workbench.live.messages import MoveBody, MoveJoints, PullBody, Reached, ReachPose
 
 N = 4
 SEEDS = [40, 41, 42, 43]
@@ -158,6 +160,33 @@ def test_joints_are_set_in_one_env_and_stay_there(picks: tuple[TaskEnv, TaskEnv]
         step = env.step(actions.hold_action(env.parts, N))
     assert step.qpos is not None  # pyright: ignore
     np.testing.assert_allclose(step.qpos[1, [0, 3]], [0.5, -1.5], atol=0.01)  # pyright: ignore
+
+
+def test_an_arm_follows_a_target_and_is_put_there_in_one_env_only(simulation: Simulation) -> None:
+    env = opened("PickCube-v1", simulation, control_mode="pd_ee_delta_pose")
+    start = env.reset(seed=SEEDS).poses.astype(float)
+    (arm,) = find_arms(env.env)
+    tool = scene_index(env.env).names.index(arm.name)
+    way = np.array([0.05, 0.06, -0.04, 0, 0, 0, 0])
+    told: list[Reached] = []
+    arms = LedArms(told.append)
+    arms.take(ReachPose(arm.name, 1, tuple(start[1, tool] + way)))
+    for _ in range(40):
+        step = env.step(arms.lead(env, actions.hold_action(env.parts, N)))
+    others = [0, 2, 3]
+    assert np.linalg.norm(step.poses[1, tool, :3] - start[1, tool, :3] - way[:3]) < 0.01  # pyright: ignore
+    assert np.abs(step.poses[others, tool, :3] - start[others, tool, :3]).max() < 2e-3  # pyright: ignore
+    assert not told[0].why
+    arms.forget()
+    before = env.rescore().poses
+    found = set_arm(env, ReachPose(arm.name, 2, tuple(start[2, tool] + way), "set"))
+    assert found is not None
+    now = found[0].poses
+    assert np.linalg.norm(now[2, tool, :3] - start[2, tool, :3] - way[:3]) < 0.01
+    np.testing.assert_allclose(now[[0, 1, 3]], before[[0, 1, 3]], atol=1e-5)
+    still = env.step(actions.hold_action(env.parts, N)).poses
+    assert np.abs(still[2, tool, :3] - now[2, tool, :3]).max() < 2e-3
+    env.close()
 
 
 def test_a_snapshot_restores_the_chosen_envs_and_leaves_the_others(picks: tuple[TaskEnv, TaskEnv]) -> None:

@@ -79,7 +79,7 @@ def test_an_arm_follows_while_the_envs_play_and_the_others_hold_still(session: S
     assert np.abs(tool(view)[0] - start[0]).max() < 2e-3
     answer = wait_until(session, lambda view: view.of(Hands).reach.reached.get(KEY), "an answer")
     assert not answer.of(Hands).reach.reached[KEY].why
-    assert np.abs(view.step.action).max() <= 1, "it is led by the action"
+    assert view.step.action is not None and np.abs(view.step.action).max() <= 1, "it is led by the action"
     assert np.isfinite(view.step.reward[1]) and not view.timeline.undo.startswith("move")
     session.do(ToggleDriving())
     assert not reach(session).targets and session.view().settings.action_source == "hold"

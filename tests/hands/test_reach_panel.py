@@ -11,7 +11,7 @@ import pytest
 from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
-from workbench.hands.reach import ArmDragged, ArmsReleased, Reach
+from workbench.hands.reach import ArmDragged, ArmKey, ArmsReleased, Reach
 from workbench.hands.reach_panel import BEYOND, WITHIN, ReachPanel, reached_text
 from workbench.hands.state import Hands
 from workbench.live.messages import Reached
@@ -32,8 +32,8 @@ def seen(reach: Reach, playing: bool = False) -> SessionView:
 
 
 def led(answer: Reached | None = None) -> Reach:
-    key = 1, ARM
-    reached = {} if answer is None else {key: answer}
+    key: ArmKey = 1, ARM
+    reached: dict[ArmKey, Reached] = {} if answer is None else {key: answer}
     return Reach(True, MappingProxyType({key: TARGET}), MappingProxyType(reached))
 
 
