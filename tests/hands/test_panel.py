@@ -154,6 +154,16 @@ def test_a_driver_sees_the_keys_and_the_set_and_ends_episodes_by_buttons(live_pa
     assert live_page.asked[-3:] == [KeepEpisode(), DiscardEpisode(), BeginAgain()]
 
 
+def test_the_sliders_of_the_action_are_hidden_while_keys_drive(live_page: Live) -> None:
+    view = running(2)
+    assert view.task is not None
+    task = replace(view.task, actions=(ActionDimension("arm/x", -1.0, 1.0),))
+    settings = replace(view.settings, action_source="sliders")
+    for driving in (False, True, False):
+        live_page.show(replace(view, task=task, settings=settings, features={State: State(driving=driving)}))
+        assert live_page.part("Run").shows("arm/x") != driving
+
+
 def test_a_planned_pose_is_shown_as_a_diff_and_saved_by_its_button(live_page: Live) -> None:
     change = SourceEdit("/tasks/push.py", "a\np = [0, 0, 0]\n", "a\np = [0.1, 0, 0]\n", ("goal too",), None)
     edit = PoseEdit("planned", 1, "cube", edit=change, message="This writes where cube begins.")

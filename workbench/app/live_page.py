@@ -33,6 +33,7 @@ from workbench.hands.joints_panel import JointsPanel, with_dragged_joint
 from workbench.hands.look import BodyView
 from workbench.hands.panel import HandsPanel
 from workbench.hands.reach_panel import ReachPanel
+from workbench.hands.state import Hands
 from workbench.live.commands import ChoosePictures, SetSeed
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
@@ -239,7 +240,7 @@ class Page:
         tabs = server.gui.add_tab_group()
         with tabs.add_tab(RUN, viser.Icon.PLAYER_PLAY):
             self._hints = add_hints(server)
-            self._run = RunPanel(server, session)
+            self._run = RunPanel(server, session, lambda view: view.of(Hands).driving)
             with self._run.actions:
                 drive = DrivePanel(server, session, self._run.below_mode)
                 self._reach = ReachPanel(server, session, self._run.below_mode + 0.1)

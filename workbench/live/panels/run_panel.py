@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import viser
@@ -86,8 +87,9 @@ class ActionSliders:
                     )
                 )
 
-    def draw(self, view: SessionView) -> None:
-        self._folder.visible = view.settings.action_source == "sliders" and bool(self._dimensions)
+    def draw(self, view: SessionView, hidden: bool) -> None:
+        shown = view.settings.action_source == "sliders" and not hidden
+        self._folder.visible = shown and bool(self._dimensions)
         self._which.visible = view.task is not None and view.task.num_envs > 1
         self._which.show(self._moved)
         if not self._folder.visible or view.told is None:
@@ -138,12 +140,18 @@ KNOWN_HINT = (
 
 
 class RunPanel(PagePart[SessionView]):
-    """The tab's controls. Each shows the session's value and sends its command to the session."""
+    """The tab's controls. Each shows the session's value and sends its command to the session.
+
+    Args:
+        is_driven: returns whether a person drives by keys; then the sliders only follow, and are hidden.
+    """
 
     does = ActionSliders.DOES
 
-    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
-        self._session = session
+    def __init__(
+        self, server: viser.ViserServer, session: LiveSession, is_driven: Callable[[SessionView], bool]
+    ) -> None:
+        self._session, self._is_driven = session, is_driven
         gui = server.gui
 
         with gui.add_folder("Actions") as self.actions:
@@ -208,7 +216,7 @@ class RunPanel(PagePart[SessionView]):
         self._known.show(
             policy if policy in known else "", options={CHOOSE: "", **{one: one for one in known}}
         )
-        self._sliders.draw(view)
+        self._sliders.draw(view, hidden=self._is_driven(view))
 
     def _draw_pause(self, view: SessionView) -> None:
         when, joints = view.pause_when, () if view.task is None else view.task.joints
