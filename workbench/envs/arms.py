@@ -37,8 +37,10 @@ MIN_JOINTS = 3
 """Minimum number of joints of an arm."""
 _ITERATIONS, _STEP = 40, 0.25
 """Iterations of one run of the solver, and share of the error that each removes. The solver ignores the limits: the result is put within them, and the next run continues."""
-_RUNS, _RUNS_FOR_POSITION = 3, 6
-"""Maximum number of runs for the whole pose, then for its position."""
+_RUNS, _RUNS_FOR_POSITION = 3, 10
+"""Maximum number of runs for the whole pose, and for its position."""
+_OTHER_STARTS = 6
+"""Number of other joint positions from which the solver starts if it finds nothing from the present ones."""
 _HALVINGS = 7
 """Bisections of the way to a target that is out of reach."""
 _ORIGIN = np.zeros(3)
@@ -191,20 +193,11 @@ def solve(arm: Arm, env: int, target: Floats) -> ArmPose:
     wanted = root.inv() * _pose_of(target[:3], target[3:] / np.linalg.norm(target[3:]))
     qpos, limits = arm.qpos(env), arm.limits(env)
     chain = _Chain(arm.models[env], maniskill_private.objects_of(arm.link)[row].index, arm.joints, limits)
-    found = chain.follow(qpos, wanted)
-    if found is None:  # a stretched arm does not bend by itself
-        found = chain.follow(chain.middle(qpos), wanted)
+    starts = [qpos, *chain.other_starts(qpos)]
+    solutions = (chain.solve(q, wanted, turns) for turns in (True, False) for q in starts)
+    found = next((one for one in solutions if one is not None), None)
     if found is None:
-        start = chain.pose(qpos).p
-        reached, beyond = 0.0, 1.0
-        found = qpos
-        for _ in range(_HALVINGS):
-            middle = (reached + beyond) / 2
-            between = chain.follow(found, _pose_of(start + middle * (wanted.p - start), wanted.q))
-            if between is None:
-                beyond = middle
-            else:
-                reached, found = middle, between
+        found = chain.approach(qpos, wanted)
     metres, degrees = left = _apart(chain.pose(found), wanted)
     poses = [root * chain.model.get_link_pose(k) for k in range(len(body.links))]
     why = "" if _is_near(left) else _why_not(arm, found, limits, left)
@@ -227,34 +220,57 @@ class _Chain:
         self.model.compute_forward_kinematics(qpos)
         return self.model.get_link_pose(self.link)
 
-    def middle(self, qpos: Floats) -> Floats:
-        """`qpos` with the joints in the middle of their limits, as far as they have any."""
-        bent, middle = np.array(qpos, np.float64), self.limits.mean(axis=1)
-        for joint in self.joints:
-            if np.isfinite(middle[joint]):
-                bent[joint] = middle[joint]
-        return bent
+    def other_starts(self, qpos: Floats) -> list[Floats]:
+        """Joint positions (J,) all over the limits, always the same: a stretched arm does not bend by itself, and one at a
+        limit does not turn back."""
+        rng = np.random.default_rng(0)
+        starts = []
+        for _ in range(_OTHER_STARTS):
+            start = np.array(qpos, np.float64)
+            for joint in self.joints:
+                low, high = self.limits[joint]
+                is_bounded = np.isfinite(low) and np.isfinite(high)
+                start[joint] = (
+                    rng.uniform(low, high) if is_bounded else qpos[joint] + rng.uniform(-np.pi, np.pi)
+                )
+            starts.append(start)
+        return starts
 
-    def follow(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64] | None:
-        """Joint positions (J,) within the limits that give the pose, or at least its position; None if there are none near
-        `qpos`."""
+    def solve(self, qpos: Floats, wanted: Pose, turns: bool) -> NDArray[np.float64] | None:
+        """Joint positions (J,) within the limits that give the pose, or without `turns` its position; None if there are none
+        near `qpos`."""
         mask = np.zeros(len(qpos), bool)
         mask[list(self.joints)] = True
         low, high = (np.where(mask, bound, qpos) for bound in self.limits.T)
         goal, q = wanted, np.asarray(qpos, np.float64)
-        for run in range(_RUNS + _RUNS_FOR_POSITION):
+        for _ in range(_RUNS if turns else _RUNS_FOR_POSITION):
             result, _, _ = self.model.compute_inverse_kinematics(
                 self.link, goal, initial_qpos=q, active_qmask=mask, max_iterations=_ITERATIONS, dt=_STEP
             )
             q = np.clip(np.asarray(result, np.float64), low, high)
             now = self.pose(q)
             left = _apart(now, wanted)
-            if _is_near(left) or (run >= _RUNS and left[0] < NEAR_METRES / 2):
+            if _is_near(left) or (not turns and left[0] < NEAR_METRES / 2):
                 return q
-            if run >= _RUNS - 1:
+            if not turns:
                 # The solver weighs metres like radians: only a rotation that it has reached leaves the position to it.
                 goal = _pose_of(wanted.p, now.q)
         return None
+
+    def approach(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64]:
+        """Joint positions (J,) that bring the end effector as far along the straight line to the pose as it can go."""
+        start, found = self.pose(qpos).p, np.asarray(qpos, np.float64)
+        reached, beyond = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            middle = (reached + beyond) / 2
+            goal = _pose_of(start + middle * (wanted.p - start), wanted.q)
+            solutions = (self.solve(found, goal, turns) for turns in (True, False))
+            between = next((one for one in solutions if one is not None), None)
+            if between is None:
+                beyond = middle
+            else:
+                reached, found = middle, between
+        return found
 
 
 def _is_near(error: tuple[float, float]) -> bool:
