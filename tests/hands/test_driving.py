@@ -23,7 +23,6 @@ from workbench.hands.drive_keys import KEYS, PAIRS, SHARE, bindings, driven_acti
 from workbench.hands.drive_panel import yaw_of
 from workbench.hands.state import Driven, Hands, apply
 from workbench.live.commands import PauseRun, UseControlMode
-from workbench.live.events import ActionTold
 from workbench.live.messages import Settings
 from workbench.live.run import first_run
 from workbench.page.command import Refused
@@ -141,13 +140,3 @@ def test_a_mode_of_absolute_targets_is_refused(session: Session) -> None:
     with pytest.raises(Refused, match="pd_joint_pos"):
         session.do(ToggleDriving())
     assert not session.view().of(Hands).driving
-
-
-def test_after_a_reset_no_env_goes_to_the_joint_targets_of_its_last_episode(session: Session) -> None:
-    session.do(UseControlMode(mode="pd_joint_pos"))
-    wait_until(session, lambda v: v.task.control_mode == "pd_joint_pos" and v.state == "paused", "the mode")
-    session.change(action_source="sliders")
-    session.happen(ActionTold((0,), (1.0,), None))
-    wait_until(session, lambda v: v.told is not None and (v.told[:, 0] == 1).all(), "the target")
-    start_over(session, 0)
-    wait_until(session, lambda v: v.told is not None and (v.told[:, 0] < 0.5).all(), "the pose of the reset")
