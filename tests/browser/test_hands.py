@@ -67,7 +67,7 @@ def test_a_dragged_slider_sets_its_joint_once_and_undo_takes_it_back(desk: Desk)
     page.locator("[data-fold='Joints']").click()
     slider = page.locator("input[type=range][name$='panda.0']")
     number = page.locator("input[type=text][name$='panda.0']")
-    expect(slider).to_be_visible()
+    expect(slider).to_be_visible(timeout=60_000)
     before = number.input_value()
     box = slider.bounding_box()
     assert box is not None
