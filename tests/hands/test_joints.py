@@ -66,7 +66,9 @@ def fresh(session: Session) -> int:
 
 def qpos(session: Session) -> np.ndarray:
     """(N, J) shown joint positions."""
-    return session.view().step.qpos
+    now = session.view().step.qpos
+    assert now is not None, "the scene has joints"
+    return now
 
 
 def set_elbow(session: Session, degrees: float = -90.0) -> None:
@@ -136,7 +138,9 @@ def test_a_keyframe_is_that_of_maniskills_own_robot_in_all_envs(session: Session
     env.reset(seed=0)
     env.agent.robot.set_qpos(env.agent.keyframes["rest"].qpos)
     view = session.view()
-    np.testing.assert_allclose(view.step.qpos, np.tile(read_joints(env), (N, 1)), atol=1e-6)
+    wanted = read_joints(env)
+    assert wanted is not None
+    np.testing.assert_allclose(qpos(session), np.tile(wanted, (N, 1)), atol=1e-6)
     links = [k for k, name in enumerate(view.task.geometry.body_names) if name.startswith("panda/")]
     assert scene_index(env).names == view.task.geometry.body_names
     expected = np.tile(read_poses(env)[:, links, :3], (N, 1, 1))
