@@ -20,6 +20,7 @@ from tests.drive.envs import batched, stock
 from tests.drive.session import jump, live_session, moment_at, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.envs import maniskill_private
+from workbench.envs.action_vector import action_parts, target_joints
 from workbench.envs.read_robots import named_agents, read_robots
 from workbench.envs.robots import Joint
 from workbench.envs.scene.scene_index import read_joints, read_poses, scene_index
@@ -269,6 +270,14 @@ def test_one_of_two_robots_is_set_and_the_other_keeps_its_targets() -> None:
     assert abs(float(first.get_qpos()[0, 0])) < 0.4
     assert torch.equal(first.get_drive_targets()[1], first.get_qpos()[1])
     assert torch.equal(second.get_drive_targets(), targets) and torch.equal(second.get_qpos(), kept)
+    env.close()
+
+
+def test_the_numbers_of_an_end_effector_are_targets_of_no_joint() -> None:
+    env = batched("PickCube-v1", control_mode="pd_ee_pose")
+    env.reset(seed=0)
+    arm, gripper = action_parts(env)
+    assert not target_joints(arm) and target_joints(gripper)
     env.close()
 
 

@@ -261,7 +261,10 @@ def _controlled_joints(controller: Any) -> list[Any]:
 
 def target_joints(part: ActionPart) -> list[Any]:
     """The joints whose absolute positions the numbers of this part are; empty for any other controller."""
-    return _controlled_joints(part.controller) if _is_absolute(part.controller) else []
+    controller = part.controller
+    # End-effector controllers inherit from joint controllers.
+    of_joints = _is_absolute(controller) and not isinstance(controller, PDEEPosController)
+    return _controlled_joints(controller) if of_joints else []
 
 
 def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:
