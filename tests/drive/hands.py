@@ -1,4 +1,4 @@
-"""A panel of hands on its own."""
+"""A `HandsPanel` without the rest of the page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Hands:
         return moved
 
     def drag(self, *ends: np.ndarray, grabbed: np.ndarray = MIDDLE) -> None:
-        """Drag from `grabbed` (relative to the body's origin) over points of the env's frame."""
+        """Drag from `grabbed`, relative to the body's origin, through `ends`, in the env's frame."""
         start = self.pose[:3] + grabbed + OFFSET
         phases = ["start", *["update"] * (len(ends) - 1)]
         for phase, end in zip(phases, ends, strict=True):

@@ -86,7 +86,7 @@ def position(session: Session, body: str) -> np.ndarray:
 
 
 def keys_towards(session: Session, pushes: bool) -> tuple[str, ...]:
-    """Keys that move the hand over a point behind the cube and down, or, when it `pushes`, ahead."""
+    """Keys that move the hand behind the cube and then down; if `pushes`, keys that move it ahead."""
     tcp, cube = position(session, TCP), position(session, "cube")
     behind = np.array([cube[0] - 0.08, cube[1], 0.02])
     aim = np.array([tcp[0] + 1, cube[1], 0.02]) if pushes else behind

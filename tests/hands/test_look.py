@@ -1,4 +1,4 @@
-"""How the selected body is looked at: hidden, followed, framed, and how far it is from another."""
+"""View tools for the selected body: hide, follow, frame, and measure the distance to another body."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a hand does on the page, and what the session is asked to do."""
+"""Drags and buttons on the page, and the requests that the session gets."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def drag(session: Session, target: np.ndarray, ends: bool = True) -> None:
 
 
 def fresh(session: Session) -> np.ndarray:
-    """Pause at the first moment of seed 0, with handles; the (N, 7) poses of the end effectors."""
+    """Pause at the first moment of seed 0, and show handles; return the (N, 7) poses of the end effectors."""
     if session.view().of(Hands).driving:
         session.do(ToggleDriving())
     session.change(action_source="hold", episode_end="continue", selected_env=1)

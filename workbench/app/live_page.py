@@ -235,7 +235,8 @@ class Page:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)
 
     def _add_tabs(self, dark: bool) -> list[PagePart[SessionView]]:
-        """Add the tabs of the right dock; returns their parts, except those that `_is_shown` limits."""
+        """Add the tabs of the right dock; returns their parts, except those that are drawn only while their
+        tab is shown."""
         server, session, clock = self._server, self._session, self._clock
         tabs = server.gui.add_tab_group()
         with tabs.add_tab(RUN, viser.Icon.PLAYER_PLAY):

@@ -260,7 +260,7 @@ def _controlled_joints(controller: Any) -> list[Any]:
 
 
 def target_joints(part: ActionPart) -> list[Any]:
-    """The joints whose absolute positions the numbers of this part are; empty for any other controller."""
+    """The joints whose absolute positions are the numbers of this part; empty for other controllers."""
     controller = part.controller
     # End-effector controllers inherit from joint controllers.
     of_joints = _is_absolute(controller) and not isinstance(controller, PDEEPosController)

@@ -30,22 +30,23 @@ from workbench.envs.scene.scene_index import once_a_scene, scene_index
 
 Floats = NDArray[np.floating[Any]]
 Pose = Any
-"""A ``sapien.Pose``, whose type refuses arrays of an unknown length."""
+"""A ``sapien.Pose``. Any, because SAPIEN's type accepts only arrays of a known length."""
 NEAR_METRES, NEAR_DEGREES = 0.005, 2.0
 """Largest errors of a pose that counts as reached."""
 MIN_JOINTS = 3
 """Minimum number of joints of an arm."""
 _ITERATIONS, _STEP = 40, 0.25
-"""Iterations of one run of the solver, and share of the error that each removes. The solver ignores the limits: the result is put within them, and the next run continues."""
+"""Iterations of one run of the solver, and share of the error that each iteration removes. The solver ignores
+the joint limits: the result of a run is clipped to them, and the next run starts from there."""
 _RUNS, _RUNS_FOR_POSITION = 3, 10
-"""Maximum number of runs for the whole pose, and for its position."""
+"""Maximum number of runs for the whole pose, and for the position alone."""
 _OTHER_STARTS = 6
 """Number of other joint positions from which the solver starts if it finds nothing from the present ones."""
 _HALVINGS = 7
-"""Bisections of the way to a target that is out of reach."""
+"""Number of bisections of the line to a target that is out of reach."""
 _ORIGIN = np.zeros(3)
 _AT_LIMIT = 1e-3
-"""Distance from a limit in rad or m at which a joint counts as being there."""
+"""Distance from a limit, in rad or m, below which a joint counts as being at the limit."""
 _VELOCITY_GAIN = 0.25
 """Share of the remaining way that a velocity controller takes in one control step."""
 
@@ -61,9 +62,9 @@ class Arm:
     link: Any
     """ManiSkill's Link of the end effector."""
     joints: tuple[int, ...]
-    """Positions of the joints among the active joints of the articulation."""
+    """Indices of the arm's joints among the active joints of the articulation."""
     models: dict[int, Any] = field(default_factory=dict)
-    """SAPIEN's PinocchioModel by env; filled when an env is asked for the first time."""
+    """SAPIEN's PinocchioModel by env; each is made when `solve` first needs it."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -88,7 +89,7 @@ class ArmPose:
     """The joint positions that bring an end effector nearest to a target."""
 
     qpos: NDArray[np.float64]
-    """(J,) of all active joints of the articulation; only the arm's own differ from those at the start."""
+    """(J,) of all active joints of the articulation; those outside the arm keep their present positions."""
     poses: NDArray[np.float32]
     """(L, 7) resulting poses of the articulation's links, in the env's frame."""
     metres: float
@@ -121,8 +122,9 @@ def _arms_of(env: Any, agent: Any) -> Iterator[Arm]:
 
 
 def _ends_with_joints(agent: Any) -> Iterator[tuple[Any, tuple[int, ...]]]:
-    """End effectors with their joints: those of end-effector controllers; else the robot's tools, with all joints that move
-    them; else the end of the chain up to the first branch, which is a hand."""
+    """The end effectors with their joints, from the first of these that the agent has: end-effector
+    controllers; tools (`tools_of`), with all joints that move them; the chain of joints up to the first
+    branch, which is a hand."""
     robot = agent.robot
     index = {joint.name: k for k, joint in enumerate(robot.active_joints)}
     controlled = {
@@ -159,7 +161,7 @@ def _ancestors(link: Any) -> tuple[int, ...]:
 
 
 def _moved_by_next_joints(robot: Any, link: Any) -> list[Any]:
-    """Links at the next active joints below a link."""
+    """The links that the next active joints below a link move."""
     found = []
     for one in robot.links:
         if one.joint.active_index is None:
@@ -178,11 +180,12 @@ def _moved_by_next_joints(robot: Any, link: Any) -> list[Any]:
 def solve(arm: Arm, env: int, target: Floats) -> ArmPose:
     """The joint positions within the limits that bring the end effector to a target, starting from the present ones.
 
-    If no joint positions give the whole pose, the position comes before the rotation. If none give the position either, the
-    end effector goes as far along the straight line to the target as it can.
+    If the solver finds none for the whole pose, it solves for the position alone. If it finds none for the
+    position, the end effector goes as far along the straight line to the target as it can.
 
     Args:
-        target: (7,) position and quaternion wxyz in the frame of the env, which has the robot.
+        env: an env that has the robot.
+        target: (7,) position and quaternion wxyz in the env's frame.
     """
     row = arm.row(env)
     assert row is not None, "the env has the robot"
@@ -221,8 +224,8 @@ class _Chain:
         return self.model.get_link_pose(self.link)
 
     def other_starts(self, qpos: Floats) -> list[Floats]:
-        """Joint positions (J,) all over the limits, always the same: a stretched arm does not bend by itself, and one at a
-        limit does not turn back."""
+        """Random joint positions (J,) within the limits, from a fixed seed. From one of these, the
+        solver may find a solution that it does not find from a stretched arm or a joint limit."""
         rng = np.random.default_rng(0)
         starts = []
         for _ in range(_OTHER_STARTS):
@@ -237,8 +240,8 @@ class _Chain:
         return starts
 
     def solve(self, qpos: Floats, wanted: Pose, turns: bool) -> NDArray[np.float64] | None:
-        """Joint positions (J,) within the limits that give the pose, or without `turns` its position; None if there are none
-        near `qpos`."""
+        """Joint positions (J,) within the limits that give the pose or, if not `turns`, only its position;
+        None if the solver finds none from `qpos`."""
         mask = np.zeros(len(qpos), bool)
         mask[list(self.joints)] = True
         low, high = (np.where(mask, bound, qpos) for bound in self.limits.T)
@@ -253,12 +256,13 @@ class _Chain:
             if _is_near(left) or (not turns and left[0] < NEAR_METRES / 2):
                 return q
             if not turns:
-                # The solver weighs metres like radians: only a rotation that it has reached leaves the position to it.
+                # The solver weighs metres like radians. With the present rotation in the goal, it reduces
+                # only the error of the position.
                 goal = _pose_of(wanted.p, now.q)
         return None
 
     def approach(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64]:
-        """Joint positions (J,) that bring the end effector as far along the straight line to the pose as it can go."""
+        """Joint positions (J,) that bring the end effector as far along the line to the pose as it can."""
         start, found = self.pose(qpos).p, np.asarray(qpos, np.float64)
         reached, beyond = 0.0, 1.0
         for _ in range(_HALVINGS):
@@ -282,7 +286,7 @@ def _why_not(arm: Arm, qpos: Floats, limits: Floats, left: tuple[float, float]) 
     if names:
         return f"no solution within the limits of {', '.join(names)}"
     if left[0] < NEAR_METRES:
-        return f"{len(arm.joints)} joints cannot turn the tool so at this place"
+        return f"{len(arm.joints)} joints cannot give the tool this rotation here"
     return "no solution was found; it may be too far away"
 
 
@@ -317,7 +321,7 @@ def steer(env: Any, arm: Arm, of: int, goal: ArmPose, action: NDArray[np.float32
 
 
 def _values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -> Floats | None:
-    """The part's numbers of the action; None if it does not move the arm."""
+    """The part's numbers of the action; None if the part does not move the arm."""
     controller: Any = part.controller
     row = arm.row(of)
     if isinstance(controller, PDEEPosController):
@@ -346,7 +350,7 @@ def _values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -> Flo
 
 
 def _pose_values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -> Floats:
-    """Numbers of an end-effector controller."""
+    """The part's numbers of the action, for an end-effector controller."""
     controller: Any = part.controller
     row, turns = arm.row(of), isinstance(controller, PDEEPoseController)
     assert row is not None, "the env has the robot"
@@ -373,12 +377,12 @@ def _pose_values(env: Any, part: ActionPart, arm: Arm, of: int, goal: ArmPose) -
 
 
 def _action_for(env: Any, part: ActionPart, wanted: Floats) -> Floats:
-    """The part's numbers (D,) that its controller scales to `wanted` (D,), without bounds."""
+    """The part's numbers (D,) that its controller scales to `wanted` (D,); they may exceed the bounds."""
     return unscaled(part, np.broadcast_to(wanted, (env.num_envs, len(wanted))))[0].astype(np.float64)
 
 
 def _in_bounds(values: Floats) -> Floats:
-    """A relative action, shortened to -1 to 1 without a change of its direction."""
+    """A relative action, scaled down to -1 to 1 without changing its direction."""
     return values / max(1.0, float(np.abs(values).max(initial=0.0)))
 
 

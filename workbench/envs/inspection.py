@@ -102,7 +102,7 @@ class BodyReadings:
     materials: tuple[tuple[float, float, float], ...]
     """Distinct materials of the shapes: static friction, dynamic friction, restitution."""
     joint: LinkJoint | None = None
-    """Of a link that a joint moves."""
+    """The joint that moves the body; None for a body that no joint moves."""
 
 
 @dataclass(frozen=True)

@@ -457,7 +457,8 @@ def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
 
 @contextmanager
 def setting_only(env: BaseEnv, env_idx: list[int]) -> Iterator[None]:
-    """Context in which ManiSkill's setters write these envs only; their rows are in ascending order of the envs."""
+    """Context in which ManiSkill's setters write these envs only. Values have a row per env, in ascending
+    order."""
     set_reset_mask(env, env_idx)
     try:
         yield
@@ -598,7 +599,7 @@ def controller_configs(agent: Any) -> list[Any]:
 
 
 def scaled_action(controller: Any, action: torch.Tensor) -> torch.Tensor:
-    """(N, D) what a controller makes of the numbers (N, D) of its action within the bounds: ``_preprocess_action``."""
+    """(N, D) result of ``_preprocess_action``, with which a controller clips and scales an action (N, D)."""
     return controller._preprocess_action(action)
 
 

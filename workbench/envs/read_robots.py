@@ -21,7 +21,7 @@ def named_agents(env: Any) -> dict[str, Any]:
 
 
 def read_robots(env: Any) -> tuple[Robot, ...]:
-    """The robots of a ManiSkill env, reset at least once.
+    """The robots of a ManiSkill env, which must have been reset at least once.
 
     Leaves out a robot whose joints are not in `StepResult.qpos`.
     """
@@ -63,7 +63,7 @@ def _targets(env: Any, articulation: Any) -> dict[str, JointTarget]:
 
 
 def _normalized_bounds(controller: Any, k: int) -> tuple[float, float]:
-    """The positions at which the controller's number k is -1 and 1."""
+    """The positions at which number k of the controller's action is -1 and 1."""
     if not controller.config.normalize_action:
         return -1.0, 1.0
     return float(controller.action_space_low[k]), float(controller.action_space_high[k])

@@ -59,7 +59,7 @@ class RobotKeyframe:
     qpos: tuple[float, ...]
     """A position for each of `Robot.joints`."""
     root: Pose | None
-    """Pose of the root; None for a robot with a fixed root, whose place the task decides."""
+    """Pose of the root; None leaves the root where it is: it is fixed, or the keyframe has no pose."""
 
 
 @dataclass(frozen=True)

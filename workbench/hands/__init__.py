@@ -1,1 +1,1 @@
-"""Hands in the scene: move and pull the selected body."""
+"""Moves bodies and robots by hand."""

@@ -38,7 +38,7 @@ class ToggleHandles(Command, frozen=True):
 
 
 class WriteBodyPose(Command, frozen=True):
-    """Show the change of the file that lets the selected body begin where it is now."""
+    """Show the change of the file that makes the selected body begin where it is now."""
 
     context = "live"
 
@@ -102,7 +102,7 @@ class KeepEpisode(Command, frozen=True):
 
 
 class DriveRobot(Command, frozen=True):
-    """Report from the page which driving keys are held, and how the gamepad is deflected."""
+    """Report the held driving keys, and the deflections of the gamepad."""
 
     keys: Annotated[tuple[str, ...], msgspec.Meta(max_length=16)]
     axes: Annotated[tuple[Deflection, ...], msgspec.Meta(max_length=4)] = ()
@@ -110,7 +110,7 @@ class DriveRobot(Command, frozen=True):
 
 
 class ToggleReach(Command, frozen=True):
-    """Show handles at the end effectors that the arms follow, or hide them."""
+    """Show or hide handles at the end effectors; the arms follow the handles."""
 
     key = "i"
     context = "live"
@@ -156,7 +156,7 @@ class MeasureFrom(Command, frozen=True):
 
 
 class DragJoint(Command, frozen=True):
-    """Show the robot with this joint at a position while its slider is dragged; while playing, drive the joint there."""
+    """Show a joint at the position of its dragged slider; while playing, drive the joint there."""
 
     robot: RobotName
     joint: JointNumber

@@ -19,13 +19,14 @@ PAIRS = (
     ("arrowleft", "arrowright"),
     ("t", "y"),
 )
-"""Keys that raise and lower the numbers of the action that zero holds still, in the order of the action. For an end
-effector these are x, y, z and rotations about x, y, z."""
+"""The keys of each pair raise and lower one number of the action. The pairs belong, in order, to the numbers
+for which zero means no motion (`ActionDimension.zero_holds`): for an end effector x, y, z and rotations about
+x, y, z."""
 GRIPPER_KEY = "g"
 KEYS = (*(key for pair in PAIRS for key in pair), GRIPPER_KEY)
 SHARE = 0.5
-"""Share of the bounds while a key is held. At the bounds of ManiSkill's Panda, 0.1 m a step, an end effector moves too
-fast for a person to place it."""
+"""Share of its bound that a number has while a key is held. At the bound itself, 0.1 m per step for
+ManiSkill's Panda, an end effector moves too fast for a person to place it."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class KeyBinding:
 
 
 def bindings(dimensions: Sequence[ActionDimension]) -> tuple[KeyBinding, ...]:
-    """The numbers that keys drive: those that zero holds still. Empty for a mode of absolute targets."""
+    """The keys of each number for which zero means no motion. Empty for a mode of absolute targets."""
     relative = [(k, one) for k, one in enumerate(dimensions) if one.zero_holds]
     return tuple(
         KeyBinding(k, one.name, *keys, *_bounds(one)) for keys, (k, one) in zip(PAIRS, relative, strict=False)
@@ -49,7 +50,8 @@ def bindings(dimensions: Sequence[ActionDimension]) -> tuple[KeyBinding, ...]:
 
 
 def gripper(dimensions: Sequence[ActionDimension]) -> tuple[tuple[int, float, float], ...]:
-    """Number, closed and open value of each gripper: targets of a controller that is called ``gripper``."""
+    """Index in the action, closed value and open value of each absolute target of a controller called
+    ``gripper``."""
     return tuple(
         (k, *_bounds(one))
         for k, one in enumerate(dimensions)
@@ -60,12 +62,12 @@ def gripper(dimensions: Sequence[ActionDimension]) -> tuple[tuple[int, float, fl
 def driven_action(
     dimensions: Sequence[ActionDimension], keys: Collection[str], yaw: float, sticks: Sequence[float] = ()
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """The numbers to set, and their values, while these keys are held.
+    """Indices of the numbers to set in the action, and their values, while these keys are held.
 
     Args:
-        sticks: further deflections, -1 to 1, in the order of `PAIRS`: those of a gamepad.
-        yaw: where the person looks: the angle from the x axis to the left, seen from above, in radians. ``w``
-            moves an end effector in this direction, away from the person.
+        yaw: direction in which the person looks, in radians: counter-clockwise from the x axis, seen from
+            above. ``w`` moves an end effector in this direction.
+        sticks: deflections of a gamepad, -1 to 1, in the order of `PAIRS`; they add to those of the keys.
     """
     bound = bindings(dimensions)
     held = [SHARE * ((one.raises in keys) - (one.lowers in keys)) for one in bound]

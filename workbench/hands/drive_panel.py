@@ -1,4 +1,4 @@
-"""Driving by keys and gamepad: the buttons and their keys on the Run tab, and the sign in the bar."""
+"""Driving by keys and gamepad: the buttons and the list of keys on the Run tab, and the sign in the bar."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class DrivePanel(PagePart[SessionView]):
     """The buttons *Drive by keys* and *Reach*, and what each key does while a person drives.
 
     Args:
-        order: viser's order in its folder.
+        order: viser's order of the panel in its folder.
     """
 
     does = (DriveRobot,)
@@ -89,7 +89,7 @@ class DrivePanel(PagePart[SessionView]):
 
 
 class DrivingSign(PagePart[SessionView]):
-    """The sign in the bar that a person drives; with it, the page sends the driving keys."""
+    """The sign in the bar while a person drives. While it is shown, the page sends the driving keys."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._html = server.gui.add_html("", visible=False)
@@ -111,10 +111,10 @@ class DrivingSign(PagePart[SessionView]):
 
 
 def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
-    """Angle in radians from the x axis to where a camera of the page looks, to the left, seen from above.
+    """Direction in which a camera of the page looks, in radians: counter-clockwise from x, seen from above.
 
     Args:
-        wxyz: the camera's orientation, looking along its z axis.
+        wxyz: the camera's orientation; the camera looks along its z axis.
     """
     w, x, y, z = wxyz
     ahead = 2 * (x * z + w * y), 2 * (y * z - w * x)
@@ -122,7 +122,7 @@ def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
 
 
 def _rows(bound: Sequence[KeyBinding], has_gripper: bool) -> list[tuple[str, str, str]]:
-    """Keys, controls of a gamepad, and what they drive."""
+    """Rows of the list: keys, gamepad controls, and the number of the action that both drive."""
     rows = [
         (f"{key_in_words(one.raises, SHORT_NAMES)} / {key_in_words(one.lowers, SHORT_NAMES)}", pad, one.name)
         for one, pad in zip(bound, LABELS, strict=False)

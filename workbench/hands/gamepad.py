@@ -18,17 +18,17 @@ LABELS = (
 """The controls that raise and lower the numbers of the action, in the order of `drive_keys.PAIRS`."""
 GRIPPER_LABEL = "A"
 _LEFT_X, _LEFT_Y, _RIGHT_X, _RIGHT_Y = range(4)
-"""Axes; to the right and down are positive."""
+"""Indices of the axes; right and down are positive."""
 _A, _LB, _RB, _LT, _RT, _UP, _DOWN, _LEFT, _RIGHT = 0, 4, 5, 6, 7, 12, 13, 14, 15
-"""Buttons."""
+"""Indices of the buttons."""
 
 
 def pad_amounts(axes: Sequence[float], buttons: Sequence[float]) -> tuple[float, ...]:
     """How far each of `LABELS` is deflected, from -1 to 1.
 
     Args:
-        axes: Deflections of the sticks, -1 to 1. Those that the gamepad lacks may be missing at the end.
-        buttons: Deflections of the buttons, 0 to 1, likewise.
+        axes: deflections of the sticks, -1 to 1; fewer than four for a gamepad with fewer axes.
+        buttons: deflections of the buttons, 0 to 1; fewer than 17 for a gamepad with fewer buttons.
     """
 
     def axis(which: int) -> float:

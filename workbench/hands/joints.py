@@ -13,7 +13,7 @@ from workbench.envs.robots import Joint
 
 Floats = NDArray[np.floating[Any]]
 FREE_DEGREES, FREE_METRES = 180.0, 2.0
-"""Half the range of a slider of a joint without limits, around 0."""
+"""A joint without limits has a slider from minus this value to plus this value."""
 
 
 def shown(joint: Joint, position: float) -> float:
@@ -22,12 +22,13 @@ def shown(joint: Joint, position: float) -> float:
 
 
 def position_of(joint: Joint, value: float) -> float:
-    """The position for a value in the unit of the page, within the joint's limits."""
+    """Position in radians or metres for a value in the page's unit, clipped to the joint's limits."""
     return min(max(value if joint.prismatic else math.radians(value), joint.low), joint.high)
 
 
 def slider_bounds(joint: Joint, position: float) -> tuple[float, float]:
-    """Ends of the joint's slider in the unit of the page: its limits; without limits, a range that contains its position."""
+    """Ends of the joint's slider in the page's unit: the joint's limits or, without limits, a range
+    that contains the position."""
     free, value = FREE_METRES if joint.prismatic else FREE_DEGREES, shown(joint, position)
     low = shown(joint, joint.low) if math.isfinite(joint.low) else min(-free, value)
     high = shown(joint, joint.high) if math.isfinite(joint.high) else max(free, value)

@@ -34,8 +34,8 @@ TITLE = "Joints"
 POSITION_MODE = "pd_joint_pos"
 """The control mode of absolute joint positions that ManiSkill's agents have."""
 PAST = "This is a past moment. Press End to go live."
-SETS = "A slider puts its joint there, at rest. Shift+U undoes it."
-DRIVES = "A slider drives its joint; the source of actions becomes sliders."
+SETS = "A slider sets its joint's position, at rest. Shift+U undoes it."
+DRIVES = "A slider drives its joint; sliders become the source of actions."
 
 
 class JointsPanel(PagePart[SessionView]):
@@ -54,7 +54,7 @@ class JointsPanel(PagePart[SessionView]):
         self._server = server
         self._robots: tuple[Robot, ...] = ()
         self._unfolded = False
-        """Whether some page has unfolded it: until then its content is neither made nor sent."""
+        """Whether a page has unfolded the fold; until then, its content is neither made nor sent."""
         self._parts: list[_RobotPart] = []
         self._fold = server.gui.add_folder(TITLE, order=order, expand_by_default=False, visible=False)
         with self._fold:
@@ -63,7 +63,7 @@ class JointsPanel(PagePart[SessionView]):
             self._scope = scope_choice(server)
 
     def unfold(self) -> None:
-        """Handle a page's report: a person has unfolded it."""
+        """Handle a page's report that a person has unfolded the fold."""
         self._unfolded = True
 
     def key(self, view: SessionView) -> object:
@@ -176,7 +176,8 @@ def short_names(joints: Iterable[Joint]) -> list[str]:
 
 
 def shown_position(view: SessionView, robot: Robot, number: int) -> float:
-    """Position of a joint that its slider shows: where it is dragged or driven to, or where it is, in radians or metres."""
+    """The position that a joint's slider shows, in radians or metres: the dragged one, else the target of a
+    driven joint, else the joint's position."""
     qpos, joint, dragged = _qpos(view), robot.joints[number], view.of(Hands).dragged
     assert qpos is not None, "the fold is visible"
     env, target = min(view.selected_env, len(qpos) - 1), joint.target
@@ -190,7 +191,7 @@ def shown_position(view: SessionView, robot: Robot, number: int) -> float:
 
 
 def with_dragged_joint(view: SessionView, poses: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`poses` (N, B, 7) with the links of a robot where a dragged slider puts them."""
+    """`poses` (N, B, 7), in which a dragged slider has moved the links of its robot."""
     dragged, qpos = view.of(Hands).dragged, _qpos(view)
     if dragged is None or qpos is None or view.task is None or view.timeline.shown is not None:
         return poses
@@ -206,7 +207,7 @@ def with_dragged_joint(view: SessionView, poses: NDArray[np.float32]) -> NDArray
 
 
 def _qpos(view: SessionView) -> NDArray[np.float32] | None:
-    """(N, J) of the shown step; None if it is not that of the task."""
+    """(N, J) joint positions of the shown step; None if the step does not fit the task."""
     if view.task is None or view.step is None or view.step.qpos is None:
         return None
     columns = max((joint.column for robot in view.task.robots for joint in robot.joints), default=0)

@@ -17,7 +17,7 @@ def link_poses(robot: Robot, poses: Floats, qpos: Floats) -> NDArray[np.float32]
     """Poses of all bodies of n envs with the robot's links where these joint positions put them.
 
     Args:
-        poses: (n, B, 7) position and quaternion wxyz; the robot's root stays where it is here.
+        poses: (n, B, 7) present position and quaternion wxyz; the robot's root keeps its pose.
         qpos: (n, len(robot.joints)) in radians or metres.
     """
     moved = np.array(poses, np.float32)

@@ -1,4 +1,4 @@
-"""How the selected body is looked at: framed, followed, hidden, and its distance to another body."""
+"""View tools for the selected body: frame, follow, hide, and measure the distance to another body."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from workbench.page.widgets.visitors import Visitor
 
 Floats = NDArray[np.floating]
 MIN_FRAMED_METRES = 0.15
-"""Minimum side of the box that is framed: the view of a small body shows its surroundings too."""
+"""Minimum side of the framed box, so that the view of a small body shows its surroundings too."""
 JOINT_COLOUR, MASS_COLOUR, MEASURE_COLOUR = (64, 200, 255), (255, 64, 160), (255, 196, 61)
 AXIS_METRES = 0.12
 """Length of a joint's axis on each side of the joint."""
@@ -56,7 +56,7 @@ class BodyView(PagePart[SessionView]):
         self._follows = ""
         """Name of the body that the viewpoints follow; empty for none."""
         self._followed: tuple[int, Floats] | None = None
-        """Env and position (3,) in the view of that body when the viewpoints followed it last."""
+        """Selected env, and position (3,) of the followed body in the view, at the last draw."""
         self._measured = ""
         """Name of the body from which distances are measured."""
         self._html = server.gui.add_html("", order=order, visible=False)
@@ -89,7 +89,8 @@ class BodyView(PagePart[SessionView]):
         self._html.content = tools_html(rows) + (render("note", text=note) if note else "")
 
     def _distance(self, view: SessionView, body: str) -> str:
-        """The distance from the measured body to the selected one, in words; empty for none."""
+        """The distance from body `_measured` to the selected body, as text; if they are the same body, what
+        to select."""
         ends = _ends(view, self._measured, body)
         if ends is None:
             return "Select a second body to see how far it is." if body and body == self._measured else ""
@@ -208,7 +209,7 @@ def _place(view: SessionView, poses: NDArray[np.float32], body: str, offset: Flo
 
 
 def _ends(view: SessionView, start: str, end: str) -> Floats | None:
-    """(2, 3) origins of the two bodies' frames in the selected env's frame; None if an end is missing."""
+    """(2, 3) origins of the two bodies' frames in the selected env's frame; None if a body is missing."""
     task, step = view.task, view.step
     if task is None or step is None or start == end:
         return None

@@ -75,7 +75,7 @@ class Selected:
     offset: Floats
     """(3,) position of the env in the view."""
     steps: int
-    """Control steps of the env's episode."""
+    """Control steps so far in the env's episode."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ class HandsPanel(PagePart[SessionView]):
     # --- the 3-D view --------------------------------------------------------------------------------
 
     def moved(self, geometry: SceneGeometry, poses: NDArray[np.float32]) -> NDArray[np.float32]:
-        """`poses` (N, B, 7), with the body that is being moved at the pointer."""
+        """`poses` (N, B, 7), with the body at the pointer while a drag moves it."""
         drag = self._drag
         if drag is None or drag.how == "pull" or drag.of.body not in geometry.body_names:
             return poses
@@ -283,7 +283,7 @@ class HandsPanel(PagePart[SessionView]):
         self._draw_resets(view.of(ResetCloud), known)
 
     def reset_under_ray(self, origin: Floats, direction: Floats) -> tuple[int, int] | None:
-        """Seed and env of the point that a click hits, to show that reset; None for no point.
+        """Seed and env of the sampled reset whose point a click hits; None if the click hits no point.
 
         Args:
             origin, direction: (3,) of the click's ray in the view.
@@ -334,7 +334,7 @@ class HandsPanel(PagePart[SessionView]):
         )
 
     def _draw_force(self, view: SessionView) -> None:
-        """Label the end of the arrow that viser draws during a drag with the spring's force."""
+        """Show the spring's force at the end of the arrow that viser draws during a drag."""
         drag, pulled = self._drag, view.pulled
         if drag is None or drag.how == "move":
             self._force.draw()
@@ -452,12 +452,12 @@ def envs_of_move(hands: Hands, env: int, num_envs: int) -> tuple[int, ...]:
 
 
 def _can_be_dragged(known: Selected, view: SessionView) -> bool:
-    """Whether a drag moves or pulls the body now. If not, the gesture is the view's: a stray click on a table must not make
-    the next drag move the table."""
+    """Whether a drag on the body moves or pulls it now; if not, the drag turns the view."""
     if view.timeline.shown is not None:
         return False
     if view.playing:
         return not why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu")
+    # Not kinematic: after a stray click on a table, the next drag must not move the table.
     return known.kind == "dynamic"
 
 

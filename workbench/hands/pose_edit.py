@@ -1,4 +1,4 @@
-"""Writes where a body was moved by hand into the author's file: the state, and its changes by events."""
+"""State of writing a body's new first pose into the author's file, and how events change it."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class PosePlanned:
 
 @dataclass(frozen=True)
 class PoseRefused:
-    """There is no such change."""
+    """The requested change cannot be made."""
 
     number: int
     why: str
@@ -87,7 +87,7 @@ class PoseChecked:
 
 @dataclass(frozen=True)
 class PlanPose:
-    """Plan the change and run it."""
+    """Plan the change, and run the task with it."""
 
     number: int
     task: TaskDescription
@@ -174,7 +174,7 @@ def _plan(edit: PoseEdit, run: Run, body: str, pose: Pose) -> Change:
 
 
 def _seeds(run: Run) -> tuple[int, ...]:
-    """Seeds of the resets that are compared: a pose that is the same after both is taken as fixed."""
+    """Two seeds: a pose that is the same after a reset with each of them counts as fixed."""
     return run.seed, run.seed + run.num_envs
 
 
@@ -194,7 +194,7 @@ def _change_file(edit: PoseEdit, revert: bool) -> Change:
 
 
 def _is_loaded(edit: PoseEdit, run: Run) -> bool:
-    """Whether the running version is the one that the change, or its reversal, has made."""
+    """Whether the running version has the new text of the change or, after a revert, the old text."""
     return (
         run.task is not None
         and edit.edit is not None

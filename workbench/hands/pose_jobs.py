@@ -77,7 +77,7 @@ class PoseJobs:
             self._happen(PosePlanned(wanted.number, edit))
 
     async def _verified(self, job: Job, wanted: PlanPose) -> SourceEdit:
-        """The planned change, whose text was run. Raises RefusedEdit."""
+        """The planned change, after a run of the new text has confirmed it. Raises RefusedEdit."""
         task, body = wanted.task, wanted.body
         if task.file is None or not task.source_files:
             raise RefusedEdit(f"{task.class_name} is installed, and installed files are not edited")
@@ -122,7 +122,7 @@ class PoseJobs:
     async def _reset(self, job: Job, load: Load, seeds: tuple[int, ...]) -> Poses:
         """(S, N, B, 7) poses after a reset of all envs with each seed.
 
-        The scene is built again: a reset does not put a body back that only its builder has placed.
+        The scene is built again, because a reset does not move a body whose pose only its builder sets.
         """
         load = replace(load, level="rebuilt", fresh=True)
 
@@ -151,12 +151,12 @@ class PoseJobs:
 
 
 def difference(poses: Poses, wanted: tuple[float, ...], body: str) -> str:
-    """How the (S, N, 7) poses of a body differ from the wanted one, as a sentence; empty if they do not."""
+    """How the (S, N, 7) poses of a body differ from the pose `wanted`, as text; empty if they do not."""
     for pose in poses.reshape(-1, 7).astype(np.float64):
         if not np.isfinite(pose).all():
             continue  # this env lacks the body
         away = float(np.linalg.norm(pose[:3] - wanted[:3]))
         turned = angle_between(pose[3:], wanted[3:])
         if away > POSITION_TOLERANCE_METRES or turned > ANGLE_TOLERANCE_RADIANS:
-            return f"{body} begins {away:.4g} m and {np.degrees(turned):.3g} degrees from there"
+            return f"{body} begins {away:.4g} m and {np.degrees(turned):.3g} degrees from the requested pose"
     return ""

@@ -14,7 +14,7 @@ MOODS = {"checked": "good", "refused": "warn", "mismatch": "bad"}
 
 
 def pose_edit_html(edit: PoseEdit) -> str:
-    """The stage of the change as HTML; empty if there is none."""
+    """The change and its stage as HTML; empty without a change."""
     if edit.stage == "none":
         return ""
     source = edit.edit if edit.stage != "undone" else None

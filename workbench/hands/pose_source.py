@@ -50,12 +50,12 @@ def plan_pose(
 
     Args:
         texts: the author's files by path.
-        task_file, class_name: the task's class.
+        task_file, class_name: file and name of the task's class.
         before: (7,) where resets put the body now: position in metres and quaternion wxyz, in the env's frame.
         after: (7,) where they shall put it.
 
     Raises:
-        RefusedEdit: the text does not tell with certainty which numbers to change; with lines to copy.
+        RefusedEdit: the text does not determine which numbers to change. The error has lines to copy.
     """
     attribute = ""
     try:
@@ -143,7 +143,8 @@ def _attribute_of(built: PoseCall) -> str:
 def _pose_call(
     classes: Sequence[tuple[SourceFile, ast.ClassDef]], built: PoseCall, attribute: str, body: str
 ) -> PoseCall:
-    """The call that makes the pose: that of each reset if there is one, else that of the builder."""
+    """The call that makes the pose: the one set after the body is built, else the builder's
+    ``initial_pose``."""
     at_reset = [*_poses_set(classes, attribute)] if attribute else []
     if len(at_reset) > 1:
         lines = " and ".join(str(file.line(node)) for file, node in at_reset)
@@ -206,8 +207,7 @@ def _built_at(built: PoseCall, body: str) -> tuple[SourceFile, ast.expr]:
 def _traced(project: Project, pose: PoseCall, before: Floats) -> TracedValue:
     """The pose call as a value whose numbers can be edited.
 
-    The value of an expression is the body's pose: `before` proves it, and a written number that differs from it is
-    refused.
+    The value of the pose is `before`. Raises RefusedEdit if a written number differs from it.
     """
     file, node = pose.file, pose.node
     given = arguments(node, ("p", "q"))
@@ -222,7 +222,8 @@ def _traced(project: Project, pose: PoseCall, before: Floats) -> TracedValue:
 
 
 def _written(project: Project, file: SourceFile, node: ast.expr) -> ast.expr:
-    """The list in ``torch.tensor([0, 0, 0.1]).repeat(b, 1)``, also through a name; other expressions unchanged."""
+    """The list in ``torch.tensor([0, 0, 0.1]).repeat(b, 1)``, or in the value of a name; other expressions
+    are returned unchanged."""
     while True:
         inner: ast.expr | None = None
         if isinstance(node, ast.Name):

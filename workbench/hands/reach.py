@@ -32,7 +32,7 @@ class ArmDragged:
 
 @dataclass(frozen=True)
 class ArmsReleased:
-    """No arm is led any more, because the page that dragged has closed."""
+    """A drag was cancelled, for example because its page has closed: no arm is led any more."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class Reach:
     targets: Mapping[ArmKey, tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
     """(7,) pose that an arm is to reach, in the env's frame."""
     reached: Mapping[ArmKey, Reached] = field(default_factory=lambda: MappingProxyType({}))
-    """The newest answer of the worker."""
+    """The worker's newest answer for each target."""
 
 
 Change = tuple[Reach, list[Any]]
 
 
 def toggle(reach: Reach, run: Run) -> Change:
-    """Show the handles, or hide them and let go. Raises Refused if no robot has an arm."""
+    """Show the handles, or hide them and let go of the arms. Raises Refused if no robot has an arm."""
     if reach.shown:
         return Reach(), let_go(reach)
     if run.task is None:
@@ -67,13 +67,14 @@ def why_no_arm(robots: tuple[str, ...]) -> str:
         return "The task has no robot."
     return (
         f"{', '.join(robots)} has no arm: its agent has no end-effector controller and no tcp, and fewer than three joints "
-        "follow each other up to the first branch."
+        "before its first branch."
     )
 
 
 def lead(reach: Reach, event: ArmDragged, run: Run) -> Change:
-    """The arm follows while the envs play. While they are paused, the worker only answers until the drag ends."""
+    """Handle a drag. While the envs play, the arm follows; while paused, it moves when the drag ends."""
     assert run.past is not None, "there is a live moment"
+    # While paused, ``try`` asks only for the joint positions, which the page shows.
     how = "follow" if run.playing else "set" if event.ends else "try"
     key = event.env, event.arm
     targets = MappingProxyType({**reach.targets, key: event.pose})
@@ -82,7 +83,7 @@ def lead(reach: Reach, event: ArmDragged, run: Run) -> Change:
 
 
 def answered(reach: Reach, event: Reached) -> Reach:
-    """The worker has answered."""
+    """Store an answer of the worker."""
     key = event.env, event.arm
     if key not in reach.targets:
         return reach
@@ -90,23 +91,24 @@ def answered(reach: Reach, event: Reached) -> Reach:
 
 
 def stepped(reach: Reach, event: Stepped) -> Reach:
-    """Envs that were reset or restored have no targets. Why a completed move fell short stays, so that it can be read."""
+    """Drop the targets of envs that were reset or restored."""
     gone = {key for key in reach.targets if event.reset_mask[key[0]]} if reach.targets else set()
     if not gone:
         return reach
+    # The answer to a move that fell short stays, so that a person can read why.
     moved = "" if event.restored is None else event.restored.moved
     fell_short = {key for key in gone if key[1] == moved and key in reach.reached and reach.reached[key].why}
     return _without(reach, gone, gone - fell_short)
 
 
 def let_go(reach: Reach, env: int | None = None) -> list[Any]:
-    """The requests that end all following, or that of one env."""
+    """The requests that let go of all arms, or of the arms of one env."""
     envs = dict.fromkeys(of for of, _ in reach.targets if env in (None, of))
     return [Send(ReachPose(env=of)) for of in envs]
 
 
 def without(reach: Reach, env: int | None = None) -> Reach:
-    """Without the targets of one env, or of all."""
+    """The state without the targets of this env; without any targets if `env` is None."""
     gone = {key for key in reach.targets if env in (None, key[0])}
     return _without(reach, gone, gone) if gone else reach
 

@@ -58,10 +58,10 @@ class _Handles:
 
 
 class ReachPanel(PagePart[SessionView]):
-    """Handles that the arms follow: while the envs play through the action, while they are paused by their joints.
+    """Handles that the arms follow. While the envs play, the arms follow through the action.
 
-    While they are paused, only the page shows the arm at its new joints; the env gets them when the drag ends. So a drag is
-    one event of the history.
+    While the envs are paused, only the page shows the arm's new joint positions; the env gets them when the
+    drag ends. So a drag is one event of the history.
 
     Args:
         order: viser's order of the text in its folder.
@@ -72,7 +72,7 @@ class ReachPanel(PagePart[SessionView]):
         self._html = server.gui.add_html("", order=order, visible=False)
         self._handles: list[_Handles] = []
         self._arms: tuple[str, ...] = ()
-        """Arm of each of the handles, while they are shown."""
+        """Body names of the end effectors that have handles now."""
         self._env = 0
         self._offset: Floats = np.zeros(3)
         self._drag: _Drag | None = None
@@ -97,7 +97,7 @@ class ReachPanel(PagePart[SessionView]):
     # --- the 3-D view --------------------------------------------------------------------------------
 
     def moved(self, view: SessionView, poses: NDArray[np.float32]) -> NDArray[np.float32]:
-        """`poses` (N, B, 7), with the arms that are dragged while paused at their new joints."""
+        """`poses` (N, B, 7), with new poses for the links of arms that are dragged while paused."""
         reach, task = view.of(Hands).reach, view.task
         tried = [one for key, one in reach.reached.items() if one.how == "try" and key in reach.targets]
         if task is None or not tried or poses.shape[:2] != (task.num_envs, len(task.geometry.body_names)):
@@ -224,6 +224,6 @@ def reached_text(answer: Reached) -> str:
 
 
 def _left(answer: Reached) -> str:
-    """The errors that remain."""
+    """The remaining errors, as text."""
     turned = f", {answer.degrees:.0f}°" if answer.degrees >= 1 else ""
     return f"{100 * answer.metres:.1f} cm{turned} left"

@@ -20,7 +20,8 @@ from workbench.live.messages import Reached, ReachPose
 from workbench.task.description import Restored
 
 _BASE_MOVED = 2e-3
-"""Change of the other joints or the root, in rad or m, after which the joints of an arm are computed again."""
+"""Change of the root or of a joint outside the arm, in rad or m, above which the arm's goal is computed
+again."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +30,11 @@ class _Target:
     goal: ArmPose | None = None
     """None until the next control step."""
     base: NDArray[np.float64] | None = None
-    """The root's pose and the other joints for which `goal` was computed."""
+    """Value of `_base` for which `goal` was computed."""
 
 
 class LedArms:
-    """The arms that follow a target while the envs step, and the questions that wait for an answer.
+    """The arms that follow a target while the envs step, and the newest ``try`` request.
 
     Args:
         send: sends an event to the server.
@@ -45,7 +46,8 @@ class LedArms:
         self._asked: ReachPose | None = None
 
     def take(self, request: ReachPose) -> None:
-        """Follow, or note a question; without an arm, let go of the env."""
+        """Follow the target, or keep a ``try`` request for `answer`; without an arm, let go of the env's
+        arms."""
         if not request.arm:
             self.forget((request.env,))
         elif request.how == "follow":
@@ -63,11 +65,12 @@ class LedArms:
 
     @property
     def is_asked(self) -> bool:
-        """Whether a question waits. Only the last one is kept: a drag asks more often than it can be answered."""
+        """Whether a ``try`` request waits. Only the newest is kept, since a drag sends them faster than they
+        are answered."""
         return self._asked is not None
 
     def answer(self, task: TaskEnv) -> None:
-        """Answer the waiting question."""
+        """Answer the waiting ``try`` request."""
         request, self._asked = self._asked, None
         if request is None or (arm := _arm(task.env, request)) is None:
             return
@@ -118,13 +121,14 @@ def set_arm(task: TaskEnv, request: ReachPose) -> tuple[StepResult, Restored, Re
 
 
 def _arm(env: Any, request: ReachPose) -> Arm | None:
-    """The arm of a request; None if the env has none, since the page may have asked before it knew of a new version."""
+    """The arm of a request; None if the env lacks it, for example because the request is from before a
+    reload."""
     found = next((arm for arm in find_arms(env) if arm.name == request.arm), None)
     return None if found is None or found.row(request.env) is None else found
 
 
 def _base(arm: Arm, env: int) -> NDArray[np.float64]:
-    """The root's pose and the positions of all joints that the arm does not move itself."""
+    """The root's pose, and the positions of all joints outside the arm."""
     root = arm.articulation.pose.raw_pose[arm.row(env)].numpy(force=True)
     return np.concatenate([root, np.delete(arm.qpos(env), list(arm.joints))])
 

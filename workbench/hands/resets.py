@@ -118,7 +118,7 @@ def _begin(cloud: ResetCloud, run: Run) -> Change:
     if load is None:
         raise Refused("No task is loaded yet.")
     batches = min(MAX_BATCHES, math.ceil(MIN_EPISODES / run.num_envs))
-    # As when a person types these seeds, so that a point can be opened.
+    # A reset with one of these seeds repeats its episodes, so that a click on a point can show its reset.
     seeds = tuple(run.seed + batch * run.num_envs for batch in range(batches))
     return ResetCloud("running", cloud.serial + 1, total=batches), [BeginSampling(load, seeds)]
 
@@ -144,7 +144,7 @@ class ResetJobs:
                 self._jobs.stop()
 
     def close(self) -> None:
-        """Stop, and begin no more jobs. Called on any thread."""
+        """Stop, and begin no more jobs. May be called on any thread."""
         do(self._jobs.close)
 
     async def _sample(self, job: Job, load: Load, seeds: tuple[int, ...]) -> None:

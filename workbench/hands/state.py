@@ -1,4 +1,4 @@
-"""What hands do to bodies and robots, and the requests that follow."""
+"""State of what a person moves and drives by hand, and the requests to the worker."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that `apply` handles."""
 LET_GO_SECONDS = 0.3
-"""Time after the last report of held keys after which they count as released: the page reports three times in it,
-unless it has closed or its line is cut."""
+"""Held keys count as released when the page has not reported for this long. While it is open and connected,
+the page reports three times in this period."""
 
 
 @dataclass(frozen=True)
@@ -108,18 +108,19 @@ class DraggedJoint:
 
 @dataclass(frozen=True)
 class Hands:
-    """Who drives: a person by keys, or another source of actions. Also the view of this feature."""
+    """What a person drives, leads and drags, and the last kept episode. Also the view of this feature."""
 
     driving: bool = False
     source: ActionSource = "random"
     episode_end: EpisodeEnd = "reset"
-    """Source of actions and end of episodes before a person took over, which return at the end."""
+    """`source` and `episode_end` are the settings from before a person took over; they return when driving
+    stops."""
     keys: tuple[str, ...] = ()
     """Keys that are held."""
     sticks: tuple[float, ...] = ()
-    """Deflections of a gamepad that are held; empty for none."""
+    """Deflections of the gamepad; empty if all are zero."""
     number: int = 0
-    """Reports so far."""
+    """Number of reports so far."""
     closes: bool = False
     """Whether the gripper closes."""
     reach: Reach = Reach()
@@ -127,7 +128,7 @@ class Hands:
     all_envs: bool = False
     """Whether a move applies to all envs; if False, to the selected one."""
     dragged: DraggedJoint | None = None
-    """A joint that the page shows elsewhere than in the env, during a drag and until the env has followed."""
+    """The joint that the page shows at its slider's position, from the drag until the env has followed."""
     next_seed: int = 0
     """Minimum seed of the next episode of the set."""
     kept: Moment | None = None
@@ -144,7 +145,7 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
     """The next state after an event, and the effects to perform.
 
     Args:
-        recorded: envs whose episodes are all recorded.
+        recorded: envs of the running recording.
 
     Raises:
         Refused: the body or the joints cannot be moved, or the robot cannot be driven now; nothing has changed.
@@ -198,8 +199,8 @@ def _start(hands: Hands, run: Run) -> Change:
         raise Refused("The task has no robot to drive.")
     if not bindings(run.task.actions):
         raise Refused(
-            f"{run.task.control_mode} takes absolute targets, which keys cannot hold. Choose a mode with delta or vel "
-            "under Control on the Run tab, such as pd_ee_delta_pose."
+            f"{run.task.control_mode} takes absolute targets, but keys give relative motions. Choose a mode "
+            "with delta or vel under Control on the Run tab, such as pd_ee_delta_pose."
         )
     return _take_over(hands, run)
 
@@ -217,14 +218,14 @@ def _take_over(hands: Hands, run: Run) -> Change:
         closes=False,
         note="",
     )
-    # An episode that ends by itself would take the robot out of the hand.
+    # An automatic reset would interrupt the person.
     changed = SettingsChanged({"action_source": "sliders", "episode_end": "continue"})
     hold = Send(SetSliderAction(tuple(range(run.num_envs)), (), ()))
     return started, [Then(changed), hold, Then(Asked(PlayRun()))]
 
 
 def _stop(hands: Hands) -> Change:
-    """Give back to the source of actions from before."""
+    """Stop driving, and restore the source of actions from before."""
     back = SettingsChanged({"action_source": hands.source, "episode_end": hands.episode_end})
     stopped, requests = _released(replace(hands, driving=False, keys=(), sticks=()))
     return stopped, [*requests, Then(back)]
@@ -258,7 +259,7 @@ def _drive(
         values += tuple(closed if closes else opened for _, closed, opened in grips)
     told: list[Any] = [Send(SetSliderAction((run.env,), dimensions, values))] if dimensions else []
     reach = hands.reach
-    if any(values[: len(bindings(run.task.actions))]):  # the keys take the arms out of the handles
+    if any(values[: len(bindings(run.task.actions))]):  # the keys override the handles
         told += of_reach.let_go(reach, run.env)
         reach = of_reach.without(reach, run.env)
     if keys or sticks:
@@ -269,7 +270,7 @@ def _drive(
 def _end_episode(
     hands: Hands, run: Run, command: BeginAgain | DiscardEpisode | KeepEpisode, recorded: tuple[int, ...]
 ) -> Change:
-    """Keep or leave the driven episode, and begin the next. An episode that is not kept stays in the history only."""
+    """End the driven episode, and begin another. An episode that is not kept stays in the history only."""
     if not hands.driving:
         raise Refused("Drive first (K): episodes are kept and discarded while you drive.")
     _require_live(run)
@@ -300,7 +301,7 @@ def _end_episode(
 
 
 def _keep(hands: Hands, run: Run, episode: PastEpisode) -> Change:
-    """Save this episode, which is the one at the newest moment."""
+    """Save this episode, which must be the newest one of the selected env."""
     assert run.past is not None, "an episode was found"
     first, last = episode.moments[0][0], episode.moments[-1]
     if first is hands.kept:
@@ -346,7 +347,7 @@ def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:
 
 
 def _set_joint(hands: Hands, run: Run, name: str, number: int, to: float, ends: bool) -> Change:
-    """A slider of a joint is dragged, or set if `ends`; `to` is in the unit of the page."""
+    """Handle a drag of a joint's slider, or its end if `ends`; `to` is in the unit of the page."""
     robot = _robot_of(run, name)
     if number >= len(robot.joints):
         raise Refused(f"{name} has only {len(robot.joints)} joints.")
@@ -354,7 +355,7 @@ def _set_joint(hands: Hands, run: Run, name: str, number: int, to: float, ends: 
     position = position_of(joint, to)
     if run.playing:
         driven = _drive_joint(run, joint, envs, position)
-        for env in envs:  # the slider takes the arm out of the handles
+        for env in envs:  # the slider overrides the handles
             driven += of_reach.let_go(hands.reach, env)
             hands = replace(hands, reach=of_reach.without(hands.reach, env))
         return hands, driven

@@ -152,7 +152,7 @@ class _Spring:
     row: int
     """The body's row in the tensors of the simulation."""
     mass: float
-    """Kilograms; for a link that of its whole articulation, which the hand has to move."""
+    """Kilograms; for a link, the mass of its whole articulation, which moves with it."""
     grabbed: NDArray[np.float64]
     target: NDArray[np.float64]
     newtons: list[float] = field(default_factory=list)

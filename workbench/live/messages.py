@@ -280,8 +280,9 @@ class ReachPose:
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     """(7,) position and quaternion wxyz in the env's frame."""
     how: Literal["follow", "try", "set"] = "follow"
-    """``follow``: in every control step by sliders, the action leads there; ``set``: put the joints there, at rest, followed
-    by a `Stepped` that has `Stepped.restored`; ``try``: only answer, and of several waiting requests only the last."""
+    """``follow``: while sliders are the source of actions, each action leads the arm there. ``set``: put the
+    joints there, at rest; followed by a `Stepped` that has `Stepped.restored`. ``try``: only answer; only the
+    newest request waits."""
     origin: int = 0
     """The server's number of the newest moment; returned unchanged."""
 
@@ -582,9 +583,9 @@ class Reached:
     why: str
     """Why the pose is out of reach, as text; empty if it is within."""
     links: tuple[str, ...] = ()
-    """Body names of the robot's links; empty unless only an answer was requested."""
+    """Body names of the robot's links; empty unless `how` is ``try``."""
     poses: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 7), np.float32))
-    """(L, 7) poses of these links with those joint positions, in the env's frame."""
+    """(L, 7) poses of these links at the joint positions that were found, in the env's frame."""
 
 
 @dataclass(frozen=True)

@@ -42,13 +42,13 @@ class KeptEpisodes:
 
     saved: int = 0
     successes: int = 0
-    """How many of the saved ones end in success."""
+    """Number of saved episodes that end in success."""
     waiting: int = 0
     """Kept episodes that are not saved yet."""
     failed: int = 0
     """Kept episodes that could not be saved."""
     why: str = ""
-    """Why the last of them could not be saved."""
+    """Why the last failed one could not be saved."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Saving:
     running: SaveRequest | None = None
     """What the running job saves; None while no job runs."""
     waiting: tuple[SaveRequest, ...] = ()
-    """What is saved after it."""
+    """Requests that wait until `running` is done."""
     kept: KeptEpisodes = KeptEpisodes()
 
     def status_of(self, run: Run) -> SaveStatus:
@@ -76,8 +76,9 @@ class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset.
 
     If the env jumped back, the moments up to the restored one are followed by those after the jump. The last
-    moment is the one at which the env terminated or, except in a kept episode, was truncated. If there is none, it
-    is the moment before the next reset or jump; in a running episode, it is the newest moment.
+    moment is the one at which the env terminated or, except in a kept episode, was truncated. If neither
+    happened, the last moment is the one before the next reset or jump; in a running episode, it is the newest
+    moment.
     """
 
     env: int
@@ -100,7 +101,7 @@ class PastEpisode:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the task reports success at its end."""
+        """Whether the task reports success at the end of the episode."""
         moment, env = self.moments[-1]
         success = moment.as_recorded.evaluate.get("success")
         return success is not None and bool(np.any(success[env]))
@@ -116,7 +117,7 @@ class SaveRequest:
     """The load that gave the running version; the background worker repeats it."""
     episodes: tuple[PastEpisode, ...]
     kept: bool = False
-    """Whether a person drives a set of episodes and keeps these; see `KeptEpisodes`."""
+    """Whether a person drove these episodes and kept them; see `KeptEpisodes`."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -245,7 +246,8 @@ def _save(
 def _begun(
     saving: Saving, what: SaveRequest, status: SaveStatus = SaveStatus()
 ) -> tuple[Saving, list[SaveEffect]]:
-    """Begin the next job; of the last one's result, `status`, only a failure stays on the page."""
+    """Begin the next job. `status` is the result of the last job; it stays on the page only if that job
+    failed."""
     job = saving.job + 1
     status = replace(status if status.failed else SaveStatus(), progress=JobProgress(WAITING, 0, 0))
     return replace(saving, status=status, job=job, running=what), [BeginSaving(job, what)]
@@ -274,7 +276,7 @@ def _stopped(saving: Saving) -> Saving:
 
 
 def _with_kept(saving: Saving, why: str = "", **more: int) -> Saving:
-    """The saving with its counts of kept episodes changed by `more`."""
+    """The state with `more` added to its counts of kept episodes."""
     kept = saving.kept
     counts = {name: getattr(kept, name) + by for name, by in more.items()}
     return replace(saving, kept=replace(kept, why=why or kept.why, **counts))

@@ -139,17 +139,17 @@ def _code(values: NDArray[np.float32]) -> str:
 
 
 _STILL: dict[str, int] = {"dynamic": 0, "kinematic": 2, "static": 3}
-"""Order of the kinds of bodies in a list; articulations are 1. What moves comes first."""
+"""Rank of each kind of body in a list; articulations have rank 1. Bodies that move come first."""
 
 
 def body_groups(
     geometry: SceneGeometry, poses: NDArray[np.float32], text: str = ""
 ) -> list[tuple[str, list[Row]]]:
-    """Rows of the bodies of an env under the name of their articulation, or under their kind.
+    """Rows of an env's bodies in named groups: links by articulation, other bodies by kind.
 
     Args:
         poses: (B, 7), NaN for bodies that the env lacks.
-        text: names must contain this, in any case.
+        text: text that the names must contain; upper and lower case are equal.
     """
     groups: dict[str, list[int]] = {}
     for row, (name, kind) in enumerate(zip(geometry.body_names, geometry.body_kinds, strict=True)):
@@ -263,7 +263,7 @@ class InspectPanel(PagePart[SessionView]):
                 self.choose_sections()
 
     def body_reading(self, view: SessionView) -> BodyReadings | None:
-        """The reading of the selected body in the selected env, live; None if there is none."""
+        """The live reading of the selected body in the selected env; None if there is none."""
         here = self._now is not None and self._now.env == view.selected_env
         return self._now.body if self._now is not None and here and view.timeline.shown is None else None
 

@@ -143,7 +143,7 @@ class RunPanel(PagePart[SessionView]):
     """The tab's controls. Each shows the session's value and sends its command to the session.
 
     Args:
-        is_driven: returns whether a person drives by keys; then the sliders only follow, and are hidden.
+        is_driven: returns whether a person drives by keys. The sliders of the action are then hidden.
     """
 
     does = ActionSliders.DOES

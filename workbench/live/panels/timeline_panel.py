@@ -354,7 +354,7 @@ NAMES = {
 }
 """Legend text of each style."""
 LASTING = REWARD_NONFINITE | FAIL | SUCCESS | TRUNCATED
-"""Events that hold in each of several steps, if the episode continues."""
+"""Events that each further step repeats if the episode continues."""
 MAX_MARKS = 250
 """Maximum number of marks on the strip: closer marks could not be distinguished."""
 
@@ -382,8 +382,9 @@ def strip_values(
 
 
 def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
-    """Tick, style and name of each mark. Where several events fall on one place, the first of `FLAGS` is drawn; of an event
-    that lasts several steps, such as an episode that continues after its time limit, only the first step."""
+    """Tick, style and name of each mark. Where several events fall on one place, the first of `FLAGS` is
+    drawn. An event that lasts several steps is drawn at the first one, for example in an episode that
+    continues after its time limit."""
     rank, names, events = list(FLAGS), dict(strip.branches), dict(strip.events)
     marks: dict[int, tuple[int, int, str]] = {}
     for tick, flags in strip.events:

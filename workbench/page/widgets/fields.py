@@ -57,8 +57,8 @@ class Field:
             lines: more than one for a larger box, in which Enter begins a new line.
             step: for a number: the change per press of an arrow key.
             options: for a choice: values of the field by their label.
-            done: for a slider: the command, with the same fields, for the value at the end of a drag and for a number
-                that is entered; by default `kind`.
+            done: for a slider: the command, with the same fields, that is sent when a drag ends or a number
+                is entered; by default `kind`.
             note: small text under the label.
         """
         self._names = [".".join([look, name_of(kind), field, *map(str, one.values())]) for one in given]

@@ -124,7 +124,7 @@ def chart_html(
 
 
 def _value_text(value: float) -> str:
-    """A step without a value is NaN in a line."""
+    """The value as text; a dash for NaN, which stands for a step without a value."""
     return "—" if np.isnan(value) else number_text(value, ".3g")
 
 
