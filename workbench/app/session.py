@@ -378,7 +378,7 @@ class Session:
     def close(self) -> None:
         """End all processes and threads; waits for episodes that are being written. Must not be called on the loop."""
         if lost := do(lambda: self._state.recording.saving.kept.waiting):
-            self._on_notice(f"The session ended before all kept episodes were saved: {lost} are lost.")
+            self._on_notice(f"The session ended before all kept episodes were saved: {lost} not saved.")
         stop_listening(self._log)
         self._changes.close()
         self._worker.stop()

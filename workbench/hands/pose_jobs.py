@@ -89,7 +89,7 @@ class PoseJobs:
         poses = before[:, :, row].reshape(-1, 7)
         poses = poses[np.isfinite(poses).all(axis=1)]
         if not len(poses) or np.ptp(poses, axis=0).max() > POSITION_TOLERANCE_METRES:
-            raise RefusedEdit(f"{body} begins at another pose in each episode or env")
+            raise RefusedEdit(f"{body} begins at different poses in different episodes or envs")
         here = tuple(map(float, poses[0]))
         plan = partial(plan_pose, texts, task.file, task.class_name, body, here, wanted.pose)
         edit = await self._aside.run(plan)

@@ -66,8 +66,8 @@ def why_no_arm(robots: tuple[str, ...]) -> str:
     if not robots:
         return "The task has no robot."
     return (
-        f"{', '.join(robots)} has no arm: its agent has no end-effector controller and no tcp, and fewer than three joints "
-        "before its first branch."
+        f"No arm in {', '.join(robots)}: no end-effector controller, no tcp, and fewer than three joints before the first "
+        "branch."
     )
 
 

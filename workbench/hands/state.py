@@ -285,7 +285,9 @@ def _end_episode(
             note = f"{_named(episode)} was not kept. Shift+U goes back to it."
         return _begin_episode(replace(hands, note=note), env, next_seed)
     if env in recorded:
-        raise Refused("Each episode of this env is recorded now. To choose, stop the recording (Shift+C).")
+        raise Refused(
+            "Each episode of this env is recorded now. To keep or discard single episodes, stop the recording (Shift+C)."
+        )
     if isinstance(episode, str):
         raise Refused(f"There is no episode to keep or discard: {episode}.")
     if isinstance(command, KeepEpisode):
