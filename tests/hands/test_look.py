@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -126,6 +126,12 @@ def test_the_distance_between_two_bodies_is_that_of_their_frames(live_page: Live
     live_page.do(SelectBody(body="cube"))
     live_page.show(view)
     assert f"{np.linalg.norm(cube - hand):.4f} m from arm/hand" in live_page.part("Inspect").html("m from")
+    poses = view.step.poses.copy()
+    poses[0, names.index("cube"), :3] = poses[0, names.index("arm/hand"), :3] + [0.3, 0, 0.4]
+    view = replace(view, step=replace(view.step, poses=poses))
+    live_page.show(view)
+    live_page.show(replace(view, settings=replace(view.settings, selected_env=0)))
+    assert "0.5000 m from arm/hand" in live_page.part("Inspect").html("m from")
 
 
 def test_bodies_are_listed_under_their_articulation_and_found_by_a_part_of_their_name(

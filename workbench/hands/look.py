@@ -67,7 +67,8 @@ class BodyView(PagePart[SessionView]):
         self._mass = InView(mass, "position")
 
     def key(self, view: SessionView) -> object:
-        return self._body(), view.step_serial, view.task_serial, self._hidden, self._follows, self._measured
+        shown = self._body(), view.step_serial, view.task_serial, view.selected_env
+        return *shown, self._hidden, self._follows, self._measured
 
     def draw(self, view: SessionView) -> None:
         body, names = self._body(), () if view.task is None else view.task.geometry.body_names
