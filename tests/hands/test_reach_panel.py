@@ -94,6 +94,35 @@ def test_a_page_that_closes_during_a_drag_lets_go(page: Page) -> None:
     assert len(page.session.asked) == 2
 
 
+def test_a_drag_ends_with_its_handles(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page.panels.server, "get_clients", lambda: {PAGE: object()})
+    page.show(Reach(shown=True))
+    page.panel.drag(PAGE, ARM, "start", np.array(TARGET))
+    page.panel.follow()
+    assert len(page.session.asked) == 1
+    page.show(Reach())
+    page.panel.follow()
+    assert page.session.asked[-1] == ArmsReleased()
+
+
+def test_a_drag_stays_in_its_env_when_another_is_selected(page: Page) -> None:
+    page.show(Reach(shown=True))
+    pose = np.array([*(np.array(TARGET[:3]) + OFFSET), *TARGET[3:]])
+    page.panel.drag(PAGE, ARM, "start", pose)
+    other = replace(page.session.shown, settings=replace(page.session.shown.settings, selected_env=2))
+    assert other.step is not None
+    page.panel.draw_in_view(other, other.step.poses, 2 * OFFSET)
+    page.panel.drag(PAGE, ARM, "end", pose)
+    assert page.session.asked[-1].env == 1
+    np.testing.assert_allclose(page.session.asked[-1].pose, TARGET, atol=1e-9)
+
+
+def test_an_answer_that_repeats_the_last_one_is_drawn(page: Page) -> None:
+    links = np.array([[1, 2, 3, 1, 0, 0, 0]], np.float32)
+    first, second = (Reached(1, ARM, "try", 0.0, 0.0, "", (ARM,), links.copy()) for _ in range(2))
+    assert page.panel.key(seen(led(first))) != page.panel.key(seen(led(second)))
+
+
 def test_a_target_out_of_reach_is_red_and_says_what_is_left(page: Page) -> None:
     page.show(led(Reached(1, ARM, "follow", 0.0, 0.0, "")), playing=True)
     (mark,) = page.panels.nodes("/hands/reach/0_target")

@@ -68,7 +68,9 @@ class JointsPanel(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         shown = view.step_serial, view.task_serial, view.selected_env, view.timeline.shown, view.playing
-        return shown, view.settings.action_source, id(view.told), view.of(Hands), self._unfolded
+        hands = view.of(Hands)
+        moves = hands.dragged, hands.all_envs
+        return shown, view.settings.action_source, id(view.told), moves, self._unfolded
 
     def urgent(self, view: SessionView) -> object:
         return view.of(Hands).dragged, view.task_serial, view.playing, self._unfolded

@@ -35,6 +35,8 @@ class _Drag:
     client: int
     arm: str
     env: int
+    offset: Floats
+    """(3,) position of the env in the view."""
 
 
 class _Handles:
@@ -195,18 +197,21 @@ class ReachPanel(PagePart[SessionView]):
             Refused: the arm cannot be moved now.
         """
         if self._drag is None:
-            self._drag = _Drag(client, arm, self._env)
+            self._drag = _Drag(client, arm, self._env, self._offset)
         drag = self._drag
         if (drag.client, drag.arm) != (client, arm):
             return
-        at = [*(pose[:3] - self._offset).tolist(), *pose[3:].tolist()]
+        at = [*(pose[:3] - drag.offset).tolist(), *pose[3:].tolist()]
         if phase == "end":
             self._drag = None
         self._session.happen(ArmDragged(arm, drag.env, tuple(map(float, at)), phase == "end"))
 
     def follow(self) -> None:
-        """Let go if the page that drags has closed."""
-        if self._drag is not None and self._drag.client not in self._server.get_clients():
+        """Let go if the page that drags has closed, or if its handles are no longer shown: they report no end."""
+        drag = self._drag
+        if drag is None:
+            return
+        if drag.client not in self._server.get_clients() or drag.arm not in self._arms:
             self.let_go()
 
     def let_go(self) -> None:

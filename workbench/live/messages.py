@@ -569,7 +569,7 @@ class SliderAction:
     """(N, A) the action."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reached:
     """How near the joints of an arm can bring its end effector to the pose of a `ReachPose`."""
 
