@@ -23,6 +23,7 @@ from workbench.hands.drive_keys import KEYS, PAIRS, SHARE, bindings, driven_acti
 from workbench.hands.drive_panel import yaw_of
 from workbench.hands.state import Driven, Hands, apply
 from workbench.live.commands import PauseRun, UseControlMode
+from workbench.live.events import Send
 from workbench.live.messages import Settings
 from workbench.live.run import first_run
 from workbench.page.command import Refused
@@ -66,6 +67,19 @@ def test_the_gripper_changes_once_for_each_press_of_its_key() -> None:
         hands, _ = apply(hands, Driven(held, 0.0), run)
         closes.append(hands.closes)
     assert closes == [True, True, True, False, False, False]
+
+
+def test_an_env_holds_still_when_another_is_selected_while_keys_are_held() -> None:
+    task = running(2).task
+    assert task is not None
+    first = replace(first_run("push.py", TaskOptions(), 2, Settings()), task=replace(task, actions=PANDA))
+    second = replace(first, settings=replace(first.settings, selected_env=1))
+    hands, _ = apply(Hands(driving=True), Driven(("w",), 0.0), first)
+    hands, effects = apply(hands, Driven(("w",), 0.0), second)
+    told = {one.request.env_idx: one.request.values for one in effects if isinstance(one, Send)}
+    assert any(told[1,]) and not any(told[0,])
+    _, effects = apply(hands, Driven((), 0.0), second)
+    assert [one.request.env_idx for one in effects if isinstance(one, Send)] == [(1,)]
 
 
 def test_the_view_decides_no_other_number_than_x_and_y() -> None:

@@ -6,21 +6,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.drive.scenes import running
 from tests.drive.session import jump, live_session, start_over, step, wait_until
 from workbench.app.session import Session
-from workbench.hands.commands import ToggleDriving, ToggleReach
-from workbench.hands.reach import ArmDragged, Reach
-from workbench.hands.state import Driven, Hands
+from workbench.hands.commands import SetJoint, ToggleDriving, ToggleReach
+from workbench.hands.reach import ArmDragged, Reach, loaded
+from workbench.hands.state import BodyMoved, Driven, Hands
 from workbench.live.commands import PauseRun, PlayRun, UseControlMode
 from workbench.live.events import SettingsChanged
 from workbench.live.history.moments import BY_HAND
+from workbench.live.messages import Settings
+from workbench.live.run import first_run
 from workbench.live.timeline_commands import UndoReset
 from workbench.live.view import SessionView
 from workbench.page.command import Refused
+from workbench.task.description import TaskOptions
 
 ARM = "panda/panda_hand_tcp"
 WAY = np.array([0.05, 0.06, -0.05, 0, 0, 0, 0])
@@ -142,6 +147,38 @@ def test_keys_take_the_arm_out_of_the_handles_and_a_reset_lets_go(session: Sessi
     assert not reach(session).targets
     session.happen(SettingsChanged({"action_source": "random"}))
     assert not session.view().of(Hands).driving
+
+
+def test_an_arm_stays_where_a_slider_has_put_it_afterwards(session: Session) -> None:
+    start = fresh(session)
+    lead(session, start[1] + WAY)
+    session.do(PauseRun())
+    session.do(SetJoint(robot="panda", joint=0, to=40.0))
+    view = wait_until(session, lambda view: apart(view, start[1] + WAY) > 0.1, "the joint")
+    assert not view.of(Hands).reach.targets
+    assert apart(step(session, 5), tool(view)[1]) < 0.01
+
+
+def test_why_a_move_fell_short_is_shown_until_the_reset(session: Session) -> None:
+    start = fresh(session)
+    jump(session, lambda: drag(session, start[1] + FAR))
+    assert reach(session).reached[KEY].why
+    start_over(session, 1)
+    assert not reach(session).reached
+
+
+def test_a_pose_of_other_than_numbers_is_refused(session: Session) -> None:
+    start = fresh(session)
+    for pose in (np.full(7, np.nan), np.array([*start[1, :3], 0, 0, 0, 0])):
+        with pytest.raises(Refused):
+            drag(session, pose)
+        with pytest.raises(Refused):
+            session.happen(BodyMoved("cube", (1,), tuple(map(float, pose))))
+
+
+def test_without_an_arm_another_task_has_no_handles() -> None:
+    run = replace(first_run("push.py", TaskOptions(), 1, Settings()), task=running(1).task)
+    assert loaded(Reach(shown=True), run) == Reach()
 
 
 def test_a_robot_without_an_arm_is_refused_in_words(

@@ -60,8 +60,7 @@ def test_the_cursor_is_at_the_position_and_the_legend_has_each_recordings_value_
     np.testing.assert_allclose(b, [[step - 2, step] for step in range(1, 7)], atol=0.02)
     expected = [(at, steps) for at, steps in ((position + 5, 10), (position + 2, 6))]
     assert chart.legend == tuple(
-        (name, f"{at}" if 1 <= at <= steps else "—")
-        for name, (at, steps) in zip("AB", expected, strict=True)
+        (name, f"{at}" if 1 <= at <= steps else "—") for name, (at, steps) in zip("AB", expected, strict=True)
     )
 
 

@@ -91,11 +91,11 @@ def answered(reach: Reach, event: Reached) -> Reach:
 
 
 def stepped(reach: Reach, event: Stepped) -> Reach:
-    """Drop the targets of envs that were reset or restored."""
-    gone = {key for key in reach.targets if event.reset_mask[key[0]]} if reach.targets else set()
+    """Drop the targets and answers of envs that were reset or restored."""
+    gone = {key for key in {*reach.targets, *reach.reached} if event.reset_mask[key[0]]}
     if not gone:
         return reach
-    # The answer to a move that fell short stays, so that a person can read why.
+    # The answer to a move that fell short stays until the next reset, so that a person can read why.
     moved = "" if event.restored is None else event.restored.moved
     fell_short = {key for key in gone if key[1] == moved and key in reach.reached and reach.reached[key].why}
     return _without(reach, gone, gone - fell_short)
@@ -105,6 +105,11 @@ def let_go(reach: Reach, env: int | None = None) -> list[Any]:
     """The requests that let go of all arms, or of the arms of one env."""
     envs = dict.fromkeys(of for of, _ in reach.targets if env in (None, of))
     return [Send(ReachPose(env=of)) for of in envs]
+
+
+def loaded(reach: Reach, run: Run) -> Reach:
+    """Another version runs, perhaps of another task: there are no targets, and without an arm no handles."""
+    return Reach(shown=reach.shown and run.task is not None and bool(run.task.arms))
 
 
 def without(reach: Reach, env: int | None = None) -> Reach:

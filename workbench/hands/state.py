@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -119,6 +120,8 @@ class Hands:
     """Keys that are held."""
     sticks: tuple[float, ...] = ()
     """Deflections of the gamepad; empty if all are zero."""
+    env: int = 0
+    """Env in which the keys and sticks are held."""
     number: int = 0
     """Number of reports so far."""
     closes: bool = False
@@ -175,7 +178,7 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
         case SettingsChanged(values={"action_source": source}) if hands.driving and source != "sliders":
             return _released(replace(hands, driving=False, keys=(), sticks=()))
         case VersionLoaded():
-            hands = replace(hands, reach=of_reach.without(hands.reach))
+            hands = replace(hands, reach=of_reach.loaded(hands.reach, run))
             if hands.driving and (run.task is None or not (bindings(run.task.actions) or hands.reach.shown)):
                 return _stop(hands)
         case ArmDragged():
@@ -184,7 +187,7 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
             return _released(hands)
         case Reached():
             return replace(hands, reach=of_reach.answered(hands.reach, event)), []
-        case Stepped() if hands.reach.targets:
+        case Stepped() if hands.reach.targets or hands.reach.reached:
             return replace(hands, reach=of_reach.stepped(hands.reach, event)), []
         case BodyMoved() | BodyPulled():
             return hands, _handle(event, run)
@@ -239,6 +242,7 @@ def _released(hands: Hands) -> Change:
 def _lead(hands: Hands, event: ArmDragged, run: Run) -> Change:
     """An arm follows its handles; while the envs play, a person takes over from the source of actions."""
     _require_live(run)
+    _require_pose(event.pose)
     effects: list[Any] = []
     if run.playing and not hands.driving:
         hands, effects = _take_over(hands, run)
@@ -258,13 +262,16 @@ def _drive(
         dimensions += tuple(k for k, _, _ in grips)
         values += tuple(closed if closes else opened for _, closed, opened in grips)
     told: list[Any] = [Send(SetSliderAction((run.env,), dimensions, values))] if dimensions else []
+    if (hands.keys or hands.sticks) and hands.env != run.env:  # another env was selected while they were held
+        still = driven_action(run.task.actions, (), yaw)
+        told.append(Send(SetSliderAction((hands.env,), *still)))
     reach = hands.reach
     if any(values[: len(bindings(run.task.actions))]):  # the keys override the handles
         told += of_reach.let_go(reach, run.env)
         reach = of_reach.without(reach, run.env)
     if keys or sticks:
         told.append(Later(LET_GO_SECONDS, DrivingDue(hands.number)))
-    return replace(hands, keys=keys, sticks=sticks, closes=closes, reach=reach), told
+    return replace(hands, keys=keys, sticks=sticks, env=run.env, closes=closes, reach=reach), told
 
 
 def _end_episode(
@@ -336,6 +343,7 @@ def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:
                 raise Refused("Pause first: a body is moved while the envs stand still.")
             if why := why_not_moved(_kind_of(run, body)):
                 raise Refused(why)
+            _require_pose(pose)
             return [Send(MoveBody(body, env_idx, pose, _newest(run)))]
         case BodyPulled(pull=PullBody(body="")):
             return [Send(event.pull)]
@@ -353,7 +361,7 @@ def _set_joint(hands: Hands, run: Run, name: str, number: int, to: float, ends: 
     robot = _robot_of(run, name)
     if number >= len(robot.joints):
         raise Refused(f"{name} has only {len(robot.joints)} joints.")
-    joint, envs = robot.joints[number], _envs_of_move(hands, run)
+    joint, envs = robot.joints[number], envs_of_move(hands, run.env, run.num_envs)
     position = position_of(joint, to)
     if run.playing:
         driven = _drive_joint(run, joint, envs, position)
@@ -389,7 +397,11 @@ def _use_keyframe(hands: Hands, run: Run, name: str, keyframe: str) -> Send:
     if run.playing:
         raise Refused("Pause first: a keyframe is set while the envs stand still.")
     every, how = tuple(range(len(robot.joints))), f"{name} was put into its keyframe {keyframe} by hand."
-    return Send(MoveJoints(name, _envs_of_move(hands, run), every, found.qpos, found.root, how, _newest(run)))
+    return Send(
+        MoveJoints(
+            name, envs_of_move(hands, run.env, run.num_envs), every, found.qpos, found.root, how, _newest(run)
+        )
+    )
 
 
 def why_not_driven(control_mode: str | None, joint: str) -> str:
@@ -422,8 +434,15 @@ def _require_live(run: Run) -> None:
         raise Refused("This is a past moment. Press End to go live, or Shift+G to continue from here.")
 
 
-def _envs_of_move(hands: Hands, run: Run) -> tuple[int, ...]:
-    return tuple(range(run.num_envs)) if hands.all_envs else (run.env,)
+def _require_pose(pose: tuple[float, ...]) -> None:
+    """A page may report any numbers, and numbers that are not finite would spread to the whole simulation."""
+    if not all(map(math.isfinite, pose)) or not any(pose[3:]):
+        raise Refused("This is no pose: it needs finite numbers, and a quaternion that is not zero.")
+
+
+def envs_of_move(hands: Hands, env: int, num_envs: int) -> tuple[int, ...]:
+    """The envs that a move in this env applies to."""
+    return tuple(range(num_envs)) if hands.all_envs else (env,)
 
 
 def _newest(run: Run) -> int:

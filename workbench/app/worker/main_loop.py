@@ -600,6 +600,7 @@ class Worker:
             step, restored = moved
             if isinstance(request, MoveJoints):
                 self._chooser.begin(restored.env_idx)  # the last targets would drive the joints back
+            self._arms.forget(restored.env_idx)
             self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
 
     def _reach(self, request: ReachPose) -> None:
