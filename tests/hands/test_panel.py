@@ -52,6 +52,18 @@ def test_a_paused_body_follows_the_pointer_and_is_moved_at_the_end(panels: Panel
     np.testing.assert_array_equal(hands.redraw(), hands.poses)
 
 
+def test_a_drag_moves_the_body_of_the_env_in_which_it_began(panels: Panels) -> None:
+    hands = Hands(panels)
+    hands.drag(hands.pose[:3], np.array([0.3, 0.2, 0.1]))
+    hands.view = replace(hands.view, settings=replace(hands.view.settings, selected_env=2))
+    hands.session.shown = hands.view
+    hands.redraw()
+    end = np.array([0.4, 0.2, 0.1]) + OFFSET
+    hands.panel.drag(PAGE, "end", end, end)
+    (moved,) = hands.session.asked
+    assert moved.env_idx == (1,)
+
+
 def test_a_playing_body_is_pulled_at_the_grabbed_point_until_the_drag_ends(panels: Panels) -> None:
     hands, grabbed = Hands(panels, playing=True), np.array([0.0, 0.0, 0.02])
     hands.drag(hands.pose[:3] + grabbed, np.array([0.0, 0.0, 0.5]), grabbed=grabbed)

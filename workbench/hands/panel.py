@@ -27,7 +27,14 @@ from workbench.hands.commands import (
 from workbench.hands.pose_edit import PoseEdit, PoseWanted
 from workbench.hands.pose_panel import pose_edit_html
 from workbench.hands.resets import ResetCloud
-from workbench.hands.state import BodyMoved, BodyPulled, Hands, why_not_moved, why_not_pulled
+from workbench.hands.state import (
+    BodyMoved,
+    BodyPulled,
+    Hands,
+    envs_of_move,
+    why_not_moved,
+    why_not_pulled,
+)
 from workbench.live.messages import PullBody
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
@@ -216,22 +223,21 @@ class HandsPanel(PagePart[SessionView]):
             case SetBodyPosition(of=axis, to=metres):
                 pose = self._required().pose.copy()
                 pose[XYZ.index(axis)] = metres
-                self._move(pose)
+                self._move(self._required(), pose)
             case SetBodyAngle(of=angle, to=degrees):
                 pose = self._required().pose.copy()
                 angles = list(rpy_of(pose[3:]))
                 angles[ANGLES.index(angle)] = degrees
                 pose[3:] = quaternion_from_rpy(*angles)
-                self._move(pose)
+                self._move(self._required(), pose)
 
     def _required(self) -> Selected:
         if self.selected is None:
             raise Refused("Select a body first: click it in the view.")
         return self.selected
 
-    def _move(self, pose: Floats) -> None:
-        """Put the selected body at a pose in the env's frame. Raises `Refused`."""
-        of = self._required()
+    def _move(self, of: Selected, pose: Floats) -> None:
+        """Put a body at a pose in the env's frame. Raises `Refused`."""
         view = self._session.view()
         envs = envs_of_move(view.of(Hands), of.env, 0 if view.task is None else view.task.num_envs)
         self._session.happen(BodyMoved(of.body, envs, tuple(map(float, pose))))
@@ -424,7 +430,7 @@ class HandsPanel(PagePart[SessionView]):
         if drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))
         else:
-            self._move(drag.pose)
+            self._move(drag.of, drag.pose)
 
     def let_go(self) -> None:
         """Cancel the drag."""
@@ -444,11 +450,6 @@ def scope_choice(server: viser.ViserServer) -> Field:
         False,
         hint="Whether a move applies to the selected env or to all envs.",
     )
-
-
-def envs_of_move(hands: Hands, env: int, num_envs: int) -> tuple[int, ...]:
-    """The envs that a move in this env applies to."""
-    return tuple(range(num_envs)) if hands.all_envs else (env,)
 
 
 def _can_be_dragged(known: Selected, view: SessionView) -> bool:
