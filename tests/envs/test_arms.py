@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosControllerConfig
+from mani_skill.agents.robots import Panda
 
 from tests.drive.envs import batched
 from workbench.envs.action_vector import hold_action
@@ -53,6 +57,15 @@ def test_each_end_effector_has_the_joints_that_move_it_alone(robot: str, ends: d
     env = opened(robot, "pd_joint_pos", num_envs=1).env
     assert {arm.name: len(arm.joints) for arm in find_arms(env)} == ends
     assert without_arms(env) == (() if ends else (robot,))
+
+
+def test_wrong_names_in_a_mode_that_is_not_used_are_no_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ManiSkill opens the task, since it reads only the mode in use."""
+    odd = PDEEPosControllerConfig(["no_joint"], -0.1, 0.1, 1e3, 1e2, ee_link="no_link")
+    own: Any = Panda.__dict__["_controller_configs"].fget
+    monkeypatch.setattr(Panda, "_controller_configs", property(lambda panda: {**own(panda), "odd": odd}))
+    env = opened("panda", "pd_joint_pos", num_envs=1).env
+    assert [len(arm.joints) for arm in find_arms(env)] == [7]
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,10 @@ def _ends_with_joints(agent: Any) -> Iterator[tuple[Any, tuple[int, ...]]]:
     controlled = {
         part.ee_link: tuple(index[name] for name in part.joint_names)
         for part in maniskill_private.controller_configs(agent)
-        if isinstance(part, PDEEPosControllerConfig) and part.ee_link is not None
+        if isinstance(part, PDEEPosControllerConfig)
+        # ManiSkill reads only the mode in use: the names of another mode may be wrong.
+        and part.ee_link in robot.links_map
+        and index.keys() >= set(part.joint_names)
     }
     if controlled:
         yield from ((robot.links_map[link], joints) for link, joints in controlled.items())
