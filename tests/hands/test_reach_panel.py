@@ -140,6 +140,7 @@ def test_only_while_paused_the_page_shows_the_joints_that_would_be_set(page: Pag
     links = np.array([[1, 2, 3, 1, 0, 0, 0]], np.float32)
     answer = Reached(1, ARM, "try", 0.0, 0.0, "", (ARM,), links)
     poses, before = page.show(led(answer)), page.show(Reach(shown=True))
+    np.testing.assert_array_equal(page.show(led(answer), playing=True), before)
     changed = np.argwhere((poses != before).any(axis=2))
     hand = seen(Reach()).task.geometry.body_names.index(ARM)  # type: ignore[union-attr]
     np.testing.assert_array_equal(changed, [[1, hand]])

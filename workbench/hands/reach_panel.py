@@ -102,7 +102,12 @@ class ReachPanel(PagePart[SessionView]):
         """`poses` (N, B, 7), with new poses for the links of arms that are dragged while paused."""
         reach, task = view.of(Hands).reach, view.task
         tried = [one for key, one in reach.reached.items() if one.how == "try" and key in reach.targets]
-        if task is None or not tried or poses.shape[:2] != (task.num_envs, len(task.geometry.body_names)):
+        if (
+            task is None
+            or not tried
+            or view.playing
+            or poses.shape[:2] != (task.num_envs, len(task.geometry.body_names))
+        ):
             return poses
         moved, names = poses.copy(), task.geometry.body_names
         for one in tried:
