@@ -64,6 +64,20 @@ def test_a_drag_moves_the_body_of_the_env_in_which_it_began(panels: Panels) -> N
     assert moved.env_idx == (1,)
 
 
+def test_a_body_that_plays_on_is_where_the_env_has_it(
+    panels: Panels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(panels.server, "get_clients", lambda: {PAGE: object()})
+    hands = Hands(panels)
+    hands.drag(hands.pose[:3], np.array([0.3, 0.2, 0.1]))
+    hands.panel.follow(hands.view)
+    assert (hands.redraw() != hands.poses).any()
+    hands.view = replace(hands.view, playing=True)
+    hands.panel.follow(hands.view)
+    np.testing.assert_array_equal(hands.redraw(), hands.poses)
+    assert not hands.session.asked
+
+
 def test_a_playing_body_is_pulled_at_the_grabbed_point_until_the_drag_ends(panels: Panels) -> None:
     hands, grabbed = Hands(panels, playing=True), np.array([0.0, 0.0, 0.02])
     hands.drag(hands.pose[:3] + grabbed, np.array([0.0, 0.0, 0.5]), grabbed=grabbed)

@@ -243,12 +243,16 @@ class HandsPanel(PagePart[SessionView]):
         self._session.happen(BodyMoved(of.body, envs, tuple(map(float, pose))))
 
     def follow(self, view: SessionView) -> None:
-        """Let go if the page that drags has closed, or if the pulled env was reset."""
+        """Let go if the page that drags has closed, if the pulled env was reset, or if a body that is being moved plays or
+        another moment is shown."""
         drag = self._drag
         if drag is None:
             return
-        closed = drag.client not in self._server.get_clients()
-        if closed or (drag.how == "pull" and _steps(view, drag.of.env) < drag.of.steps):
+        if drag.how == "pull":
+            over = _steps(view, drag.of.env) < drag.of.steps
+        else:
+            over = view.playing or view.timeline.shown is not None
+        if over or drag.client not in self._server.get_clients():
             self.let_go()
 
     # --- the 3-D view --------------------------------------------------------------------------------
