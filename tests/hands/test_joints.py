@@ -15,6 +15,7 @@ import pytest
 import sapien
 import torch
 from mani_skill.agents.base_agent import Keyframe
+from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import batched, stock
 from tests.drive.session import jump, live_session, moment_at, start_over, step, wait_until
@@ -294,6 +295,23 @@ def test_a_keyframe_moves_the_root_of_a_robot_that_stands_free() -> None:
     np.testing.assert_allclose(env.agent.robot.get_qpos()[0], own.qpos, atol=1e-5)
     np.testing.assert_allclose(env.agent.robot.pose.p[0], own.pose.p + [0, 0, 1], atol=1e-5)
     assert not np.allclose(env.agent.robot.get_qpos()[1], own.qpos, atol=1e-3)
+    env.close()
+
+
+def test_a_keyframe_that_is_no_pose_is_left_out_and_the_task_loads() -> None:
+    env = batched("UnitreeG1Stand-v1")
+    env.reset(seed=0)
+    qpos, pose = env.agent.keyframes["right_knee_up"].qpos, Pose.create_from_pq(torch.ones((2, 3)))
+    env.agent.keyframes = {
+        "ragged": Keyframe(sapien.Pose(), [[1.0], [2.0, 3.0]]),
+        "short": Keyframe(sapien.Pose(), qpos[:3]),
+        "not finite": Keyframe(sapien.Pose(), np.full_like(qpos, np.nan)),
+        "one for each env": Keyframe(pose, qpos),
+        "no rotation": Keyframe(sapien.Pose(q=[0, 0, 0, 0]), qpos),
+    }
+    (robot,) = read_robots(env)
+    roots = {one.name: one.root for one in robot.keyframes}
+    assert roots == {"one for each env": (1, 1, 1, 1, 0, 0, 0), "no rotation": None}
     env.close()
 
 

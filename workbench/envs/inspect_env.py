@@ -185,7 +185,7 @@ def _joint_of(env: Any, env_idx: int, component: Any) -> LinkJoint | None:
     if joint is None or joint.dof == 0:
         return None
     # Not SAPIEN's own name, which carries the env's number.
-    name = next(
+    names = (
         merged.name
         for articulation in env.scene.articulations.values()
         for at in np.flatnonzero(np.asarray(maniskill_private.envs_of(articulation)) == env_idx)
@@ -196,6 +196,7 @@ def _joint_of(env: Any, env_idx: int, component: Any) -> LinkJoint | None:
         )
         if own.name == joint.name
     )
+    name = next(names, joint.name)
     low, high = (float(one) for one in joint.limits[0])
     pose = joint.pose_in_child
     # SAPIEN's joints move about, or along, the x axis of their frame.

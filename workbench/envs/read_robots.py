@@ -8,6 +8,7 @@ from typing import Any
 import sapien
 import torch
 from mani_skill.agents.base_agent import Keyframe
+from mani_skill.utils.structs.pose import Pose as ManiSkillPose
 
 from workbench.envs import action_vector, maniskill_private
 from workbench.envs.robots import Joint, JointTarget, Pose, Robot, RobotKeyframe, RobotLink
@@ -88,15 +89,27 @@ def _links(env: Any, articulation: Any) -> Iterator[RobotLink]:
 
 
 def _keyframes(agent: Any) -> Iterator[RobotKeyframe]:
-    """The keyframes that have a position for each joint."""
+    """The keyframes that have a finite position for each joint."""
     fixed = bool(agent.robot.fixed_root_link.all())
     for name, keyframe in agent.keyframes.items():
         if not isinstance(keyframe, Keyframe) or keyframe.qpos is None:
             continue
-        qpos = torch.as_tensor(keyframe.qpos, dtype=torch.float64).flatten().tolist()
-        if len(qpos) == len(agent.robot.active_joints):
-            root = None if fixed or keyframe.pose is None else _pose(keyframe.pose)
-            yield RobotKeyframe(name, tuple(qpos), root)
+        try:
+            qpos = torch.as_tensor(keyframe.qpos, dtype=torch.float64).flatten()
+        except (TypeError, ValueError):
+            continue  # ManiSkill does not read the keyframes of a task that does not use them
+        if len(qpos) == len(agent.robot.active_joints) and qpos.isfinite().all():
+            root = None if fixed or keyframe.pose is None else _root_pose(keyframe.pose)
+            yield RobotKeyframe(name, tuple(qpos.tolist()), root)
+
+
+def _root_pose(pose: Any) -> Pose | None:
+    """The pose of a keyframe, of the first env if it has one for each; None if it is no pose."""
+    row = ManiSkillPose.create(pose).raw_pose[0].double().cpu()
+    if not row.isfinite().all() or row[3:].norm() == 0:
+        return None
+    x, y, z, w, a, b, c = row.tolist()
+    return x, y, z, w, a, b, c
 
 
 def _pose(pose: Any) -> Pose:

@@ -150,6 +150,9 @@ def apply(edit: PoseEdit, event: object, run: Run) -> Change:
             return PoseEdit(number=edit.number + 1), []
         case VersionLoaded() if edit.writing and _is_loaded(edit, run):
             return _loaded(edit, run)
+        case VersionLoaded() if edit.writing and not _is_loaded(edit, run, other=True):
+            # The author has edited the file again, or opened another task.
+            return PoseEdit(number=edit.number + 1), []
         case TaskFailed(at_run=False) if edit.writing and edit.stage == "written":
             message = "The file does not load. The change is in it: revert it if it is the cause."
             return replace(edit, message=message), []
@@ -193,14 +196,18 @@ def _change_file(edit: PoseEdit, revert: bool) -> Change:
     return changed, [ChangePoseFile(edit.number, edit.edit, revert)]
 
 
-def _is_loaded(edit: PoseEdit, run: Run) -> bool:
-    """Whether the running version has the new text of the change or, after a revert, the old text."""
+def _is_loaded(edit: PoseEdit, run: Run, other: bool = False) -> bool:
+    """Whether the running version has the new text of the change or, after a revert, the old text.
+
+    Args:
+        other: ask for the text that the file had before instead.
+    """
+    old = (edit.stage == "undone") != other
     return (
         run.task is not None
         and edit.edit is not None
         and all(
-            run.task.source.get(change.file)
-            == plain_line_ends(change.old_text if edit.stage == "undone" else change.new_text)
+            run.task.source.get(change.file) == plain_line_ends(change.old_text if old else change.new_text)
             for change in edit.edit.changes
         )
     )

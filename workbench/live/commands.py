@@ -188,7 +188,7 @@ class ChooseInspected(Command, frozen=True):
 class FindBodies(Command, frozen=True):
     """List the bodies whose name contains this text; empty for all."""
 
-    text: str
+    text: Annotated[str, msgspec.Meta(max_length=256)]
 
 
 class SelectBody(Command, frozen=True):
