@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from workbench.hands.drive_panel import yaw_of
 from workbench.hands.state import Driven, Hands, apply
 from workbench.live.commands import PauseRun, UseControlMode
 from workbench.live.events import Send
-from workbench.live.messages import Settings
+from workbench.live.messages import SetSliderAction, Settings
 from workbench.live.run import first_run
 from workbench.page.command import Refused
 from workbench.task.description import ActionDimension, TaskOptions
@@ -69,6 +70,12 @@ def test_the_gripper_changes_once_for_each_press_of_its_key() -> None:
     assert closes == [True, True, True, False, False, False]
 
 
+def slider_actions(effects: list[Any]) -> list[SetSliderAction]:
+    """The slider actions that these effects send to the worker."""
+    requests = [effect.request for effect in effects if isinstance(effect, Send)]
+    return [request for request in requests if isinstance(request, SetSliderAction)]
+
+
 def test_an_env_holds_still_when_another_is_selected_while_keys_are_held() -> None:
     task = running(2).task
     assert task is not None
@@ -76,10 +83,10 @@ def test_an_env_holds_still_when_another_is_selected_while_keys_are_held() -> No
     second = replace(first, settings=replace(first.settings, selected_env=1))
     hands, _ = apply(Hands(driving=True), Driven(("w",), 0.0), first)
     hands, effects = apply(hands, Driven(("w",), 0.0), second)
-    told = {one.request.env_idx: one.request.values for one in effects if isinstance(one, Send)}
-    assert any(told[1,]) and not any(told[0,])
+    values = {request.env_idx: request.values for request in slider_actions(effects)}
+    assert any(values[1,]) and not any(values[0,])
     _, effects = apply(hands, Driven((), 0.0), second)
-    assert [one.request.env_idx for one in effects if isinstance(one, Send)] == [(1,)]
+    assert [request.env_idx for request in slider_actions(effects)] == [(1,)]
 
 
 def test_the_view_decides_no_other_number_than_x_and_y() -> None:

@@ -306,7 +306,7 @@ def test_a_keyframe_that_is_no_pose_is_left_out_and_the_task_loads() -> None:
         "ragged": Keyframe(sapien.Pose(), [[1.0], [2.0, 3.0]]),
         "short": Keyframe(sapien.Pose(), qpos[:3]),
         "not finite": Keyframe(sapien.Pose(), np.full_like(qpos, np.nan)),
-        "one for each env": Keyframe(pose, qpos),
+        "one for each env": Keyframe(pose, qpos),  # type: ignore[arg-type]
         "no rotation": Keyframe(sapien.Pose(q=[0, 0, 0, 0]), qpos),
     }
     (robot,) = read_robots(env)
