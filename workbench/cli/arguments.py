@@ -104,7 +104,7 @@ class EnvArguments:
         num_envs: environments that run at once.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (cpu, as no gpu test has passed yet).
         rules: what happens when the task breaks a rule of GPU simulation: stop, warn, or off (no checks). By
-            default, overwriting the state of other envs stops; everything else warns.
+            default, a breach that makes every later number wrong stops the task; others warn.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
         seed: seed of the first env or episode; the following ones count up.
@@ -132,7 +132,7 @@ class EpisodeArguments:
             value (only).
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (cpu, as no gpu test has passed yet).
         rules: what happens when the task breaks a rule of GPU simulation: stop, warn, or off (no checks). By
-            default, overwriting the state of other envs stops; everything else warns.
+            default, a breach that makes every later number wrong stops the task; others warn.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
         seed: seed of the first episode; the following ones count up.
@@ -158,7 +158,7 @@ class RescoreArguments:
         num_envs: environments that run at once in each worker.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (cpu, as no gpu test has passed yet).
         rules: what happens when the task breaks a rule of GPU simulation: stop, warn, or off (no checks). By
-            default, overwriting the state of other envs stops; everything else warns.
+            default, a breach that makes every later number wrong stops the task; others warn.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
     """

@@ -191,7 +191,7 @@ def review(
         folder: folder of the recordings, searched recursively: .rrd, .h5 and .json of the workbench, and .h5
             with .json of ManiSkill's RecordEpisode.
         rules: what happens when a task opened from here breaks a rule of GPU simulation: stop, warn, or off
-            (no checks). By default, overwriting the state of other envs stops; everything else warns.
+            (no checks). By default, a breach that makes every later number wrong stops the task; others warn.
         task: a task file to search for the envs of ManiSkill's recordings; repeatable. Not needed for ManiSkill's
             own envs.
         imports: a module that registers the env ids of the recordings, such as lab.tasks, imported in the processes

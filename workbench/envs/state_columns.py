@@ -98,8 +98,8 @@ def _read(env: BaseEnv) -> tuple[StateRows | None, dict[str, Any]]:
 
 
 def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
-    """Name ``obs/...`` and value (N, ...) of each entry of the last observation that has a row for each env;
-    no pictures."""
+    """Yield the name (``obs/...``) and the value (N, ...) of each entry of the last observation. Leaves out pictures, and
+    entries without a row for each env."""
     for name, value in flat_entries(task.obs):
         shape = () if name.partition("/")[0] in _PICTURES else getattr(value, "shape", ())
         if len(shape) > 0 and shape[0] == task.num_envs:

@@ -186,8 +186,7 @@ def log_html(printed: Printed, wanted: str) -> str:
     """The last lines that pass the filter.
 
     Args:
-        wanted: text that a line must contain, case-insensitive; ``stderr:`` or ``stdout:`` before it selects
-            one stream.
+        wanted: text that a line must contain, case-insensitive; the prefix ``stderr:`` or ``stdout:`` selects one stream.
     """
     stream, colon, rest = wanted.partition(":")
     if not (colon and stream in ("stdout", "stderr")):
