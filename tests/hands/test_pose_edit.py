@@ -140,7 +140,7 @@ def test_a_random_pose_is_refused(opened: Session, file: Path) -> None:
     assert text != MINIMAL
     load(opened, file, text)
     planned = want(opened)
-    assert planned.stage == "refused" and "in each episode" in planned.message and "0.12" in planned.snippet
+    assert planned.stage == "refused" and "cube" in planned.message and "0.12" in planned.snippet
 
 
 def test_an_edit_that_the_author_made_meanwhile_is_not_overwritten(opened: Session, file: Path) -> None:
