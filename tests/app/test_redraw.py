@@ -24,7 +24,7 @@ from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Leaf
 from workbench.envs.keywords import HowMade, Keyword
-from workbench.envs.robots import Joint, JointTarget, Robot, RobotKeyframe, RobotLink
+from workbench.envs.robots import Joint, JointTarget, RobotDescription, RobotKeyframe, RobotLink
 from workbench.hands.joints_panel import TITLE as JOINTS
 from workbench.hands.reach import Reach
 from workbench.hands.state import DraggedJoint, Hands
@@ -58,7 +58,7 @@ MODES = (Keyword("control_mode", "choice", '"pd_joint_pos"', choices=('"pd_joint
 LENS = CameraSettings((0.3, 0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
 CAMERA = replace(camera(), settings=LENS)
 _HERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-ARM = Robot(
+ARM = RobotDescription(
     "arm",
     (Joint("hinge", False, -1.0, 1.0, 0, JointTarget(0, 1.0, 0.0)),),
     (RobotLink(0, -1, -1, _HERE, _HERE), RobotLink(2, 0, 0, _HERE, _HERE)),

@@ -13,7 +13,7 @@ from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.drive.scenes import changed, running
 from workbench.envs.keywords import HowMade, Keyword
-from workbench.envs.robots import Joint, JointTarget, Robot, RobotKeyframe, RobotLink
+from workbench.envs.robots import Joint, JointTarget, RobotDescription, RobotKeyframe, RobotLink
 from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe
 from workbench.hands.joints_panel import PAST, TITLE, short_names, with_dragged_joint
 from workbench.hands.state import DraggedJoint, Hands
@@ -23,7 +23,7 @@ from workbench.page.commands import TellUnfolded
 HERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 HAND = 2
 """Place of the hand among the bodies of `running`."""
-ARM = Robot(
+ARM = RobotDescription(
     "arm",
     (
         Joint("arm_base", False, -math.inf, math.inf, 0),
@@ -35,7 +35,7 @@ ARM = Robot(
 MODES = (Keyword("control_mode", "choice", '"pd_joint_vel"', choices=('"pd_joint_vel"', '"pd_joint_pos"')),)
 
 
-def view_of(*robots: Robot, playing: bool = False, **changes: Any) -> SessionView:
+def view_of(*robots: RobotDescription, playing: bool = False, **changes: Any) -> SessionView:
     """Three envs with these robots; env 1 is selected."""
     view = running(3, selected_env=1, playing=playing, **changes)
     assert view.task is not None and view.step is not None

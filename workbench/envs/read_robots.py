@@ -11,23 +11,23 @@ from mani_skill.agents.base_agent import Keyframe
 from mani_skill.utils.structs.pose import Pose as ManiSkillPose
 
 from workbench.envs import action_vector, maniskill_private
-from workbench.envs.robots import Joint, JointTarget, Pose, Robot, RobotKeyframe, RobotLink
+from workbench.envs.robots import Joint, JointTarget, Pose, RobotDescription, RobotKeyframe, RobotLink
 from workbench.envs.scene.scene_index import joints_of_scene, scene_index
 
 
 def named_agents(env: Any) -> dict[str, Any]:
-    """The agent of each robot by `Robot.name`, in the order of the action."""
+    """The agent of each robot by `RobotDescription.name`, in the order of the action."""
     found = maniskill_private.agents(env)
     return {agent.uid if len(found) == 1 else f"{agent.uid}-{i}": agent for i, agent in enumerate(found)}
 
 
-def read_robots(env: Any) -> tuple[Robot, ...]:
+def read_robots(env: Any) -> tuple[RobotDescription, ...]:
     """The robots of a ManiSkill env, which must have been reset at least once.
 
     Leaves out a robot whose joints are not in `StepResult.qpos`.
     """
     return tuple(
-        Robot(name, joints, tuple(_links(env, agent.robot)), tuple(_keyframes(agent)))
+        RobotDescription(name, joints, tuple(_links(env, agent.robot)), tuple(_keyframes(agent)))
         for name, agent in named_agents(env).items()
         if (joints := tuple(_joints(env, agent)))
     )

@@ -42,9 +42,9 @@ class RobotLink:
     body: int
     """The link's place along B of `StepResult.poses`."""
     parent: int
-    """Index of the parent in `Robot.links`; -1 for the root."""
+    """Index of the parent in `RobotDescription.links`; -1 for the root."""
     joint: int
-    """Index in `Robot.joints`; -1 for a fixed joint."""
+    """Index in `RobotDescription.joints`; -1 for a fixed joint."""
     in_parent: Pose
     """The joint's frame in the parent's frame."""
     in_link: Pose
@@ -57,13 +57,13 @@ class RobotKeyframe:
 
     name: str
     qpos: tuple[float, ...]
-    """A position for each of `Robot.joints`."""
+    """A position for each of `RobotDescription.joints`."""
     root: Pose | None
     """Pose of the root; None leaves the root where it is: it is fixed, or the keyframe has no pose."""
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotDescription:
     """A robot that every env has."""
 
     name: str

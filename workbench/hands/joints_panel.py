@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.envs.robots import Joint, Robot
+from workbench.envs.robots import Joint, RobotDescription
 from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe
 from workbench.hands.joints import (
     keyframe_code,
@@ -52,7 +52,7 @@ class JointsPanel(PagePart[SessionView]):
 
     def __init__(self, server: viser.ViserServer, order: float) -> None:
         self._server = server
-        self._robots: tuple[Robot, ...] = ()
+        self._robots: tuple[RobotDescription, ...] = ()
         self._unfolded = False
         """Whether a page has unfolded the fold; until then, its content is neither made nor sent."""
         self._parts: list[_RobotPart] = []
@@ -100,7 +100,7 @@ class JointsPanel(PagePart[SessionView]):
 class _RobotPart:
     """The keyframes and sliders of one robot."""
 
-    def __init__(self, server: viser.ViserServer, robot: Robot, alone: bool) -> None:
+    def __init__(self, server: viser.ViserServer, robot: RobotDescription, alone: bool) -> None:
         self._robot, self._alone = robot, alone
         self._head = server.gui.add_html("")
         self._sliders: list[Field] = []
@@ -177,7 +177,7 @@ def short_names(joints: Iterable[Joint]) -> list[str]:
     return [name[end:][::-1] for name in backwards]
 
 
-def shown_position(view: SessionView, robot: Robot, number: int) -> float:
+def shown_position(view: SessionView, robot: RobotDescription, number: int) -> float:
     """The position that a joint's slider shows, in radians or metres: the dragged one, else the target of a
     driven joint, else the joint's position."""
     qpos, joint, dragged = _qpos(view), robot.joints[number], view.of(Hands).dragged

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from viser.transforms import SE3
 
-from workbench.envs.robots import Robot
+from workbench.envs.robots import RobotDescription
 
 Floats = NDArray[np.floating[Any]]
 
 
-def link_poses(robot: Robot, poses: Floats, qpos: Floats) -> NDArray[np.float32]:
+def link_poses(robot: RobotDescription, poses: Floats, qpos: Floats) -> NDArray[np.float32]:
     """Poses of all bodies of n envs with the robot's links where these joint positions put them.
 
     Args:

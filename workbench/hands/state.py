@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from workbench.actions.sources import ActionSource
-from workbench.envs.robots import Joint, Robot
+from workbench.envs.robots import Joint, RobotDescription
 from workbench.hands import reach as of_reach
 from workbench.hands.commands import (
     BeginAgain,
@@ -99,10 +99,10 @@ class DraggedJoint:
     """A joint whose slider is dragged while the envs stand still."""
 
     robot: str
-    """As in `Robot.name`."""
+    """As in `RobotDescription.name`."""
     env_idx: tuple[int, ...]
     joint: int
-    """Place in `Robot.joints`."""
+    """Place in `RobotDescription.joints`."""
     position: float
     """In radians or metres."""
 
@@ -451,7 +451,7 @@ def _newest(run: Run) -> int:
     return run.past.history.last
 
 
-def _robot_of(run: Run, name: str) -> Robot:
+def _robot_of(run: Run, name: str) -> RobotDescription:
     """Raises `Refused` if there is no such robot, or nothing can be moved now."""
     _require_live(run)
     assert run.task is not None, "there is a live moment"

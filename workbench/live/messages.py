@@ -243,7 +243,7 @@ class MoveJoints:
     controllers are set to the new positions. Dropped if the task has no such robot or joint."""
 
     robot: str
-    """As in `Robot.name`."""
+    """As in `RobotDescription.name`."""
     env_idx: tuple[int, ...]
     joints: tuple[int, ...]
     """Places in `Robot.joints`; the other joints keep their positions."""

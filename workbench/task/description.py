@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, Picture, PictureDegree
 from workbench.envs.gpu_rules import Degree, Finding
 from workbench.envs.keywords import HowMade
-from workbench.envs.robots import Robot
+from workbench.envs.robots import RobotDescription
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 from workbench.pictures.camera_report import ObjectToSee
@@ -148,7 +148,7 @@ class TaskDescription:
     """Objects for which a camera report can state how well a camera sees them."""
     joints: tuple[str, ...] = ()
     """Names of the joints whose positions are in `StepResult.qpos`."""
-    robots: tuple[Robot, ...] = ()
+    robots: tuple[RobotDescription, ...] = ()
     """The robots whose joints a person can set."""
     notices: tuple[str, ...] = ()
     """Notices about a working task, as sentences."""
