@@ -228,8 +228,8 @@ def no_process_left_behind() -> Iterator[None]:
     if "workbench.episodes.reader.reading" in sys.modules:
         # Both serve the whole process for its lifetime.
         sys.modules["workbench.episodes.reader.reading"].stop_reading()
-    if "workbench.live.process.fork_server" in sys.modules:
-        sys.modules["workbench.live.process.fork_server"].worker_forks.end()
+    if "workbench.live.process.fork_client" in sys.modules:
+        sys.modules["workbench.live.process.fork_client"].worker_forks.end()
     until(lambda: not _children(), "the end of all processes that tests started", 10, seen=_children)
 
 

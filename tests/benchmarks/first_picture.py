@@ -32,7 +32,7 @@ from workbench.live.commands import RestartWorker
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
 from workbench.live.process import worker_process
-from workbench.live.process.fork_server import start_anew, worker_forks
+from workbench.live.process.fork_client import start_anew, worker_forks
 from workbench.live.process.supervisor import WorkerOptions
 from workbench.live.view import SessionView
 from workbench.machine.processes.family import proportional_memory

@@ -65,7 +65,7 @@ def test_restart_ends_uninterruptible_work(desk: Desk) -> None:
     assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
     # The new worker and the next spare are forks: neither did the imports itself.
     every = [Path(f"/proc/{pid}/cmdline").read_text() for pid in family(desk.opened.process.pid)]
-    assert any("worker.fork_workers" in one for one in every)
+    assert any("worker.fork_server" in one for one in every)
     assert not any("session.worker.start" in one for one in every)
 
 

@@ -15,6 +15,6 @@ def workers_of(server: psutil.Process) -> list[psutil.Process]:
             continue
         if "workbench.app.worker.start" in command:
             keepers.append(child)
-        elif "workbench.app.worker.fork_workers" in command:
+        elif "workbench.app.worker.fork_server" in command:
             keepers += child.children()
     return sorted(keepers, key=lambda process: process.create_time())

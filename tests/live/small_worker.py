@@ -1,6 +1,6 @@
 """A worker process without a task, which starts in half a second and does what a test asks of it.
 
-Everything else is real: start-up, keeper, heartbeat, signals and connection. Started like `fork_server`.
+Everything else is real: start-up, keeper, heartbeat, signals and connection. Started like `fork_client`.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ def list_html(
     kept = [result.rule for result in rest if result.state == "kept"]
     told = [result for result in rest if result.silenced or result.notes]
     return render(
-        "checks",
+        "finding_cards",
         **known,
         rest=len(rest) - len(failed),
         failed=failed,

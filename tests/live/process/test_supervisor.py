@@ -17,7 +17,7 @@ import pytest
 from tests.drive.waiting import until
 from workbench.cameras.questions import RunCameras
 from workbench.live.messages import Event, Load, Loading, Request, WarmUp
-from workbench.live.process import fork_server, supervisor, worker_process
+from workbench.live.process import fork_client, supervisor, worker_process
 from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import Death, End, SpareWorker, Supervisor, WorkerOptions
 from workbench.machine.processes.wire import Call
@@ -109,8 +109,8 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
         assert (dash_m, module) == ("-m", "workbench.app.worker.start")
         return [sys.executable, "-P", str(SMALL_WORKER), *arguments]
 
-    monkeypatch.setattr(fork_server, "python_command", command)
-    monkeypatch.setattr(worker_process, "worker_forks", SimpleNamespace(start=fork_server.start_anew))
+    monkeypatch.setattr(fork_client, "python_command", command)
+    monkeypatch.setattr(worker_process, "worker_forks", SimpleNamespace(start=fork_client.start_anew))
     # Timeouts of seconds, for slow machines, are tenths here.
     for name, seconds in (
         ("_BUSY_SECONDS", 0.8),
@@ -348,14 +348,14 @@ def test_failing_first_requests_end_the_worker_and_are_tried_again(caplog: pytes
 def test_without_a_startable_worker_it_gives_up_until_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    command, failures = fork_server.python_command, iter(range(4))
+    command, failures = fork_client.python_command, iter(range(4))
 
     def fails(*arguments: str) -> list[str]:
         if next(failures, None) is not None:
             raise OSError("no more processes")
         return command(*arguments)
 
-    monkeypatch.setattr(fork_server, "python_command", fails)
+    monkeypatch.setattr(fork_client, "python_command", fails)
     one = Supervised(WorkerOptions())
     one.worker.start()
     try:

@@ -50,7 +50,7 @@ def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:
         if mix.made[0] != place[0]:
             here = f"in {mix.made[0]}:{mix.made[1]}"
         yield Found(
-            f"A tensor that was made {here} without a device meets a tensor on self.device ({mix.operation}). On a GPU "
+            f"A tensor that was made {here} without a device is combined ({mix.operation}) with one on self.device. On a GPU "
             "this raises. Make the first one with device=self.device, or within `with torch.device(self.device):`.",
             place,
         )

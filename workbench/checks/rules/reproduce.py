@@ -248,7 +248,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
         )
         yield Found(
             f"{_named(differing)} after {step} {'step' if step == 1 else 'steps'} of the same actions from the same seeds. "
-            f"No reset seeds {drawn[1]}: draw from self._batched_episode_rng, or in the reset.",
+            f"{drawn[1]} does not depend on the seed: draw from self._batched_episode_rng, or in the reset.",
             drawn[0],
         )
         return

@@ -642,8 +642,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
     alone = checkup.alone
     if len(set(alone.shapes.values())) > 1 and not alone.rebuilds:
         yield Found(
-            "Another seed gives other shapes or colours, but a single env is never rebuilt after its first seed. In "
-            "__init__, take `reconfiguration_freq=None` and, if it is None, pass on 1 for num_envs == 1 and 0 otherwise.",
+            "Another seed gives other shapes or colours, but a single env keeps those of its first seed. Let __init__ take "
+            "`reconfiguration_freq=None` and, if it is None, give BaseEnv 1 for num_envs == 1 and 0 otherwise.",
             checkup.places.hook("__init__", "_load_scene"),
         )
     elif not alone.rebuilds:

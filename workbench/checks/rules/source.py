@@ -387,7 +387,8 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
                 else "self._batched_episode_rng, which has a generator for each env's seed"
             )
             yield Found(
-                f"No reset seeds {drawn}: the same seed gives another episode each time. Draw from {write}.",
+                f"{drawn} does not depend on the seed of the reset, so the same seed gives another episode each time. Draw from "
+                f"{write}.",
                 module.place(node, function.name),
             )
 

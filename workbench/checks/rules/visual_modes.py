@@ -71,8 +71,8 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
             told.setdefault(leaf, []).append(body)
     for leaf, bodies in told.items():
         yield Found(
-            f"{leaf!r} of _get_obs_extra() follows {listed(bodies)} in obs_mode "
-            f"{checkup.pictured.env.obs_mode!r}. Put it behind `if self.obs_mode_struct.use_state:`.",
+            f"In obs_mode {checkup.pictured.env.obs_mode!r}, which has pictures, {leaf!r} of _get_obs_extra() tells where "
+            f"{listed(bodies)} is. Put it behind `if self.obs_mode_struct.use_state:`.",
             place_of_leaf(checkup, f"extra/{leaf}"),
         )
     if not told:

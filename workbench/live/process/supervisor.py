@@ -115,7 +115,7 @@ class SpareWorker:
     """A second, warmed-up worker that replaces a worker that dies. Used on one thread, which must outlive the
     spare.
 
-    A new worker makes a render system and compiles its shaders; if it is not forked (`fork_server`), it also imports
+    A new worker makes a render system and compiles its shaders; if it is not forked (`fork_client`), it also imports
     torch, SAPIEN and ManiSkill, which takes 4 s or more. The spare does this in the background once a task runs, then
     sleeps; it takes memory (`memory`). After it is taken, the next load starts another one (`begin_soon`).
     """

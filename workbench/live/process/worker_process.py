@@ -28,7 +28,7 @@ from workbench.live.messages import (
     SingleStep,
     without_steps,
 )
-from workbench.live.process.fork_server import worker_forks
+from workbench.live.process.fork_client import worker_forks
 from workbench.live.process.heartbeat import (
     INTERRUPT_SIGNAL,
     STACK_SIGNAL,
@@ -61,7 +61,7 @@ to request a pause before the next read."""
 class WorkerProcess:
     """One worker process. `receive` is called on one thread; all other methods are thread-safe.
 
-    Start a worker on a thread that outlives it: a worker that is not forked (`fork_server`) is ended by the
+    Start a worker on a thread that outlives it: a worker that is not forked (`fork_client`) is ended by the
     kernel with the thread that started it, so that no worker is left behind when the server is killed.
 
     A worker has no standard input, so that a task that reads it gets EOF and does not hang. It has its own

@@ -15,8 +15,8 @@ from tests.drive.processes import workers_of
 from tests.drive.session import live_session, wait_until
 from tests.drive.waiting import TIMEOUT_SECONDS, until
 from tests.live.hazards import write_task
-from workbench.live.process import fork_server, worker_process
-from workbench.live.process.fork_server import WorkerForks
+from workbench.live.process import fork_client, worker_process
+from workbench.live.process.fork_client import WorkerForks
 from workbench.live.process.worker_process import WorkerProcess
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -54,7 +54,7 @@ def listens(worker: WorkerProcess) -> bool:
 
 
 def is_fork(worker: WorkerProcess) -> bool:
-    return "fork_workers" in " ".join(psutil.Process(worker.pid).cmdline())
+    return "worker.fork_server" in " ".join(psutil.Process(worker.pid).cmdline())
 
 
 def ends_as_asked(worker: WorkerProcess) -> bool:
@@ -124,7 +124,7 @@ def test_a_worker_with_other_code_or_settings_is_not_forked(
     for change in (
         lambda to: to.setenv("MS_ASSET_DIR", str(tmp_path)),
         lambda to: to.chdir(tmp_path),
-        lambda to: to.setattr(fork_server, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))),
+        lambda to: to.setattr(fork_client, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))),
     ):
         with monkeypatch.context() as changed:
             change(changed)

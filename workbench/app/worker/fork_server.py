@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from workbench.app.worker import start
-from workbench.live.process.fork_server import Forked, ForkEnded, NewWorker
+from workbench.live.process.fork_client import Forked, ForkEnded, NewWorker
 from workbench.machine.processes.child_environment import python_command, quick_imports
 from workbench.machine.processes.wire import Unpacker, pack_message
 
@@ -29,7 +29,7 @@ descriptors that `start.run` takes, and the worker's stdout and stderr."""
 
 
 def main() -> None:
-    """Run the fork server: ``python -m workbench.app.worker.fork_workers SOCKET``. When SOCKET closes, the
+    """Run the fork server: ``python -m workbench.app.worker.fork_server SOCKET``. When SOCKET closes, the
     fork server and its workers end.
 
     A fork takes some 30 ms; the imports take five seconds of one core. The fork server runs none of the

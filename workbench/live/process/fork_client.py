@@ -1,4 +1,4 @@
-"""Starts worker processes by forking a process that has imported their modules."""
+"""Client of the fork server (`app/worker/fork_server.py`): asks it for worker processes."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class WorkerForks:
         working directory has changed since it was started."""
         present = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
-            self._process, self._control = start_with_socket("workbench.app.worker.fork_workers", present[0])
+            self._process, self._control = start_with_socket("workbench.app.worker.fork_server", present[0])
             self._from = present
         return self._control if self._from == present else None
 
