@@ -193,6 +193,17 @@ def test_the_episode_that_was_just_left_can_be_kept(driven: Session) -> None:
     wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
 
 
+def test_a_kept_episode_that_is_taken_up_again_is_kept_anew(driven: Session) -> None:
+    before = kept(driven)
+    drive(driven, 2)
+    jump(driven, lambda: driven.do(KeepEpisode()))
+    jump(driven, lambda: driven.do(UndoReset()))
+    drive(driven, 2)
+    jump(driven, lambda: driven.do(KeepEpisode()))
+    view = wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved == before.saved + 2, "the files")
+    assert read_episode(Path(view.of(RecordingStatus).last_file or "")).length == 4
+
+
 def test_what_a_hand_moved_is_told_when_the_episode_is_kept(driven: Session) -> None:
     before = kept(driven)
     drive(driven, 1)

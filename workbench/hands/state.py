@@ -135,7 +135,7 @@ class Hands:
     next_seed: int = 0
     """Minimum seed of the next episode of the set."""
     kept: Moment | None = None
-    """First moment of the episode that was kept last."""
+    """Last moment of the episode that was kept last: one that was taken up again and driven on is kept anew."""
     note: str = ""
     """What became of the last episode of the set."""
 
@@ -312,16 +312,16 @@ def _end_episode(
 def _keep(hands: Hands, run: Run, episode: PastEpisode) -> Change:
     """Save this episode, which must be the newest one of the selected env."""
     assert run.past is not None, "an episode was found"
-    first, last = episode.moments[0][0], episode.moments[-1]
-    if first is hands.kept:
+    last, env = episode.moments[-1]
+    if last is hands.kept:
         raise Refused("This episode is kept already.")
     what = request_of(run, (run.env,), kept=True)
     if isinstance(what, str):
         raise Refused(f"{what}.")
     note = f"{_named(episode)} is kept, {'with' if episode.succeeded else 'without'} success."
-    if run.past.history.by_hand(*last):
+    if run.past.history.by_hand(last, env):
         note += " A body was moved or pulled by hand in it, so its actions alone do not repeat it."
-    return replace(hands, kept=first, note=note), [Then(EpisodesKept(what))]
+    return replace(hands, kept=last, note=note), [Then(EpisodesKept(what))]
 
 
 def _begin_episode(hands: Hands, env: int, seed: int) -> Change:
