@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.envs.task_drawings import MAX_ITEMS, Drawing, DrawingKind, drawings
+from workbench.envs.task_drawings import ITEM_SHAPES, MAX_ITEMS, Drawing, DrawingKind, drawings
 
 ORANGE = "#ff922b"
 
@@ -30,7 +30,7 @@ def points(name: str, positions: Any, color: str = ORANGE, size: float = 0.01, e
         color: ``#rrggbb``.
         size: diameter in metres.
     """
-    _draw("points", name, positions, (3,), color, size, env_idx)
+    _draw("points", name, positions, color, size, env_idx)
 
 
 def lines(name: str, segments: Any, color: str = ORANGE, env_idx: Any = None) -> None:
@@ -40,7 +40,7 @@ def lines(name: str, segments: Any, color: str = ORANGE, env_idx: Any = None) ->
         segments: (N, 2, 3) or (N, K, 2, 3), start and end.
         color: ``#rrggbb``.
     """
-    _draw("lines", name, segments, (2, 3), color, 0.0, env_idx)
+    _draw("lines", name, segments, color, 0.0, env_idx)
 
 
 def arrows(name: str, segments: Any, color: str = ORANGE, size: float = 0.01, env_idx: Any = None) -> None:
@@ -51,7 +51,7 @@ def arrows(name: str, segments: Any, color: str = ORANGE, size: float = 0.01, en
         color: ``#rrggbb``.
         size: width in metres.
     """
-    _draw("arrows", name, segments, (2, 3), color, size, env_idx)
+    _draw("arrows", name, segments, color, size, env_idx)
 
 
 def frames(name: str, poses: Any, size: float = 0.1, env_idx: Any = None) -> None:
@@ -61,7 +61,7 @@ def frames(name: str, poses: Any, size: float = 0.1, env_idx: Any = None) -> Non
         poses: a ManiSkill ``Pose``, or (N, 7) or (N, K, 7): position and quaternion wxyz.
         size: length of the axes in metres.
     """
-    _draw("frames", name, getattr(poses, "raw_pose", poses), (7,), ORANGE, size, env_idx)
+    _draw("frames", name, getattr(poses, "raw_pose", poses), ORANGE, size, env_idx)
 
 
 def text(name: str, positions: Any, texts: str | Sequence[str], env_idx: Any = None) -> None:
@@ -71,7 +71,7 @@ def text(name: str, positions: Any, texts: str | Sequence[str], env_idx: Any = N
         positions: (N, 3).
         texts: one text for all envs, or one for each.
     """
-    _draw("text", name, positions, (3,), ORANGE, 0.0, env_idx, texts)
+    _draw("text", name, positions, ORANGE, 0.0, env_idx, texts)
 
 
 def remove(name: str) -> None:
@@ -83,7 +83,6 @@ def _draw(
     kind: DrawingKind,
     name: str,
     values: Any,
-    item: tuple[int, ...],
     color: str,
     size: float,
     env_idx: Any,
@@ -91,7 +90,7 @@ def _draw(
 ) -> None:
     if not drawings.on:
         return
-    data = _array(values)
+    data, item = _array(values), ITEM_SHAPES[kind]
     if data.shape[1:] == item:
         data = data[:, None]
     if data.ndim != 2 + len(item) or data.shape[2:] != item:
@@ -107,7 +106,7 @@ def _draw(
     each = (texts,) * len(data) if isinstance(texts, str) else tuple(map(str, texts))
     if kind == "text" and len(each) != len(data):
         raise ValueError(f"draw.text({name!r}) got {len(each)} texts for {len(data)} envs")
-    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    red, green, blue = bytes.fromhex(color.removeprefix("#"))
     drawings.put(name, Drawing(kind, data, (red, green, blue), float(size), each), envs)
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tests.drive.reviewed import Reviewed, review_of
 from tests.drive.waiting import until
 from tests.episodes.sweep_files import sweep_folder
 from workbench.episodes.columns import TextEntry
+from workbench.episodes.drawings import DrawingTrack
 from workbench.live.commands import SelectBody, TogglePlay
 from workbench.live.timeline_commands import Seek
 from workbench.page.command import Command
@@ -48,6 +50,26 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shown(child_process: None, folder: Path, gated_server: GatedServer) -> Iterator[Reviewed]:
     with review_of(gated_server, folder) as reviewed:
         yield reviewed
+
+
+def test_the_view_has_what_the_task_drew_at_the_shown_step(
+    child_process: None, gated_server: GatedServer, tmp_path: Path
+) -> None:
+    for seed in (1, 2):
+        places = np.array([(state, 0, seed) for state in range(4)], np.float32)
+        colors, sizes = np.zeros((5, 3), np.uint8), np.ones(5, np.float32)
+        begins = np.array([0, 1, 2, 3, 4, 4])
+        dot = DrawingTrack("dot", "points", np.arange(5), begins, places, colors, sizes, ())
+        write(tmp_path, replace(made(4, seed=seed), drawn=(dot,)), pictures=False)
+    with review_of(gated_server, tmp_path) as shown:
+        shown.open(1, 2)
+        for index, state in ((0, 0), (0, 3), (1, 3), (1, 1)):
+            shown.select(index)
+            shown.seek(state)
+            (dot,) = shown.nodes("/drawn/dot")
+            np.testing.assert_allclose(dot.points, [[state, 0, index + 1]])
+        shown.seek(4)
+        assert not shown.nodes("/drawn/")
 
 
 SLIDER = "step of the timeline"

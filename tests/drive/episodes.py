@@ -15,6 +15,7 @@ from tests.drive.rows import EpisodeRow, append
 from tests.drive.scenes import camera, table_scene
 from workbench.envs.camera_data import CameraInfo, Picture
 from workbench.envs.scene.shapes import SceneGeometry
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.episode import Episode, EpisodeInfo
 from workbench.episodes.writing.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
 from workbench.episodes.writing.from_journal import Header, read_header
@@ -125,6 +126,7 @@ def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> 
                 state,
                 pictures=(seen,) if pictures and state % every == 0 else (),
                 others=episode.other_entries_at(state),
+                drawn=episode.drawings_at(state),
             ),
         )
     return writer
@@ -178,6 +180,8 @@ class Made:
     cameras: list[Track]
     env_states: dict[str, NDArray] = field(default_factory=dict)
     obs: dict[str, NDArray] = field(default_factory=dict)
+    drawn: list[dict[str, Drawing]] = field(default_factory=list)
+    """What is drawn in each state; empty if nothing is ever drawn."""
 
     def rows(self) -> Iterator[EpisodeRow]:
         for state in range(len(self.poses)):
@@ -187,6 +191,7 @@ class Made:
                 env_states={name: values[state] for name, values in self.env_states.items()},
                 obs={name: values[state] for name, values in self.obs.items()},
                 pictures=tuple(picture for track in self.cameras for picture in track.picture(state)),
+                drawn=self.drawn[state] if self.drawn else {},
             )
 
     def writer(self, folder: Path) -> EpisodeWriter:

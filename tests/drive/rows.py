@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from workbench.envs.camera_data import Picture
 from workbench.envs.step_result import OtherEntry
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.columns import BATCH, EVALUATE, OBS, STATE, BatchPacker, Layout
 from workbench.episodes.writing.episode_writer import EpisodeWriter
 
@@ -29,6 +30,7 @@ class EpisodeRow:
     truncated: bool = False
     pictures: tuple[Picture, ...] = ()
     others: Mapping[str, OtherEntry] = field(default_factory=dict)
+    drawn: Mapping[str, Drawing] = field(default_factory=dict)
 
 
 _packers: WeakKeyDictionary[EpisodeWriter, BatchPacker] = WeakKeyDictionary()
@@ -53,4 +55,4 @@ def packed(row: EpisodeRow, packer: BatchPacker, actions: int) -> tuple[Layout, 
 
 def append(writer: EpisodeWriter, row: EpisodeRow) -> None:
     packer = _packers.setdefault(writer, BatchPacker())
-    writer.append(*packed(row, packer, writer.actions), row.pictures, row.others)
+    writer.append(*packed(row, packer, writer.actions), row.pictures, row.others, row.drawn)

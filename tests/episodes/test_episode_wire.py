@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraInfo
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.episodes.columns import MAX_TEXT_LINES, TextEntry
+from workbench.episodes.drawings import MAX_DRAWING_BYTES, MAX_DRAWINGS, DrawingTrack
 from workbench.episodes.encoded_pictures import EncodedPictures, Modality, encode
 from workbench.episodes.episode import BrokenFile, CameraTrack, Episode, EpisodeInfo
 from workbench.episodes.reader.episode_wire import (
@@ -27,6 +28,16 @@ from workbench.episodes.reader.requests import EpisodeRead, PictureRead, RowsRea
 from workbench.machine.processes.wire import Unpacker, pack_message
 
 T, B = 3, 2
+DOTS = DrawingTrack(
+    "dots",
+    "points",
+    np.array([0, 2]),
+    np.array([0, 2, 2]),
+    np.ones((2, 3), np.float32),
+    np.full((2, 3), 9, np.uint8),
+    np.ones(2, np.float32),
+    (),
+)
 PICTURE = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
 
 
@@ -63,6 +74,7 @@ def an_episode() -> Episode:
         {"": np.ones((T + 1, 5))},
         {"mean": np.ones(T + 1)},
         {"phase": ((0, TextEntry("str", "reach", False, True)), (2, None))},
+        (DOTS,),
         (BrokenFile("a.h5", "is broken."),),
     )
 
@@ -95,6 +107,10 @@ def test_an_episode_is_equal_after_the_transfer() -> None:
         assert list(getattr(episode, name)) == list(getattr(there, name))
         for key, values in getattr(there, name).items():
             np.testing.assert_array_equal(getattr(episode, name)[key], values, strict=True)
+    (dots,) = episode.drawn
+    assert dots.key == DOTS.key and dots.at(3) is None
+    for name in ("states", "begins", "data", "colors", "sizes"):
+        np.testing.assert_array_equal(getattr(dots, name), getattr(DOTS, name), strict=True)
     assert episode.geometry is not None and there.geometry is not None
     assert replace(episode.geometry, visuals=()) == replace(there.geometry, visuals=())
     first, second = episode.geometry.visuals
@@ -122,6 +138,10 @@ def test_a_shape_is_sent_once_for_all_episodes_that_share_it() -> None:
 
 def of_episode(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
     return lambda read: msgspec.structs.replace(read, episode=replace(read.episode, **changes))
+
+
+def of_drawing(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
+    return of_episode(drawn=(replace(DOTS, **changes),))
 
 
 def of_scene(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
@@ -156,6 +176,24 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
         (of_episode(action=numbers(T, 3)), "actions of shape"),
         (of_episode(terminated=numbers(T + 1, kind="?")), "terminated of shape"),
         (of_episode(texts={"a": ((0, None),) * (MAX_TEXT_LINES + 1)}), "too many entries"),
+        (of_episode(drawn=(DOTS, DOTS)), "two of one name"),
+        (
+            of_episode(drawn=tuple(replace(DOTS, name=str(k)) for k in range(3 * MAX_DRAWINGS))),
+            "600 drawings",
+        ),
+        (of_drawing(data=numbers(2, 7)), "do not fit"),
+        (of_drawing(data=numbers(2, 3) * np.nan), "do not fit"),
+        (of_drawing(data=numbers(9000, 3), begins=np.array([0, 9000, 9000])), "do not fit"),
+        (of_drawing(data=numbers(MAX_DRAWING_BYTES // 12 + 1, 3)), "32 MB"),
+        (of_drawing(begins=np.array([0, 3, 2])), "do not fit"),
+        (of_drawing(begins=np.array(0), states=np.array(0), data=np.array(0)), "do not fit"),
+        (of_drawing(begins=np.array([0, 2])), "do not fit"),
+        (of_drawing(begins=numbers(0, kind="i8"), states=numbers(0, kind="i8")), "do not fit"),
+        (of_drawing(states=np.array([0, T + 1])), "do not fit"),
+        (of_drawing(states=np.array([2, 0])), "do not fit"),
+        (of_drawing(sizes=numbers(1)), "do not fit"),
+        (of_drawing(colors=numbers(2, 4, kind="u1")), "do not fit"),
+        (of_drawing(kind="text"), "do not fit"),
         (of_scene(body_kinds=("static",)), "different number of bodies"),
         (of_first("visuals", shape=10**9), "without a shape"),
         (of_first("visuals", bodies=np.array([B])), "bodies that do not exist"),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,6 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 DrawingKind = Literal["points", "lines", "arrows", "frames", "text"]
+ITEM_SHAPES: Mapping[DrawingKind, tuple[int, ...]] = {
+    "points": (3,),
+    "lines": (2, 3),
+    "arrows": (2, 3),
+    "frames": (7,),
+    "text": (3,),
+}
+"""Shape of one item: a position; start and end; position and quaternion wxyz."""
 MAX_ITEMS = 2000
 """Maximum number of points, lines, arrows or frames of one drawing, per env."""
 
@@ -20,8 +29,8 @@ class Drawing:
 
     kind: DrawingKind
     data: NDArray[np.float32]
-    """In the frame of each env, metres; rows are NaN for envs in which it is not drawn. Points and text (N, K, 3), lines
-    and arrows (N, K, 2, 3) with start and end, frames (N, K, 7) with position and quaternion wxyz."""
+    """(N, K, ...) with K items of the shape in `ITEM_SHAPES`, in the frame of each env, metres; rows are NaN for envs in
+    which it is not drawn."""
     color: tuple[int, int, int] = (255, 146, 43)
     size: float = 0.01
     """Diameter of points, width of arrows, length of the axes of frames, in metres; not used for lines and text."""
@@ -32,6 +41,12 @@ class Drawing:
     def nbytes(self) -> int:
         """Approximate memory in bytes."""
         return 200 + self.data.nbytes + sum(map(len, self.texts))
+
+    def of_env(self, env: int) -> Drawing:
+        """The drawing in one env, as a batch of 1, without its NaN items."""
+        data = self.data[env]
+        data = data[np.isfinite(data).all(axis=tuple(range(1, data.ndim)))]
+        return replace(self, data=data[None], texts=self.texts[env : env + 1])
 
 
 class TaskDrawings:
@@ -72,6 +87,16 @@ class TaskDrawings:
     def remove(self, name: str) -> None:
         """Remove a drawing; nothing happens if there is none of this name."""
         self._drawn.pop(name, None)
+
+    @contextmanager
+    def taken_into(self, drawn: dict[str, Drawing]) -> Iterator[None]:
+        """Within this context, keep drawings in `drawn`. Drawings of other envs of the process stay out of it."""
+        before = self.on, self._drawn
+        self.on, self._drawn = True, drawn
+        try:
+            yield
+        finally:
+            self.on, self._drawn = before
 
     def begin_version(self) -> None:
         """Begin to load a version."""

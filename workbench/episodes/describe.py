@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -47,6 +48,7 @@ def describe(episode: Episode) -> Description:
         batch=_columns(episode.batch),
         texts=episode.texts,
         obs=_columns(episode.obs),
+        drawings=tuple(track.key for track in episode.drawn) or UNSET,
     )
 
 

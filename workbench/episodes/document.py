@@ -19,6 +19,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from workbench.envs.camera_data import CameraInfo, CameraKind, MovedCamera, PictureDegree
 from workbench.envs.scene.shapes import BodyKind
+from workbench.envs.task_drawings import DrawingKind
 from workbench.episodes.columns import TextTrack
 from workbench.episodes.episode import (
     MAX_BODIES,
@@ -180,6 +181,8 @@ class Description(Struct, frozen=True, kw_only=True):
     texts: Annotated[dict[Name, TextTrack], Entries] = {}
     """Entries of ``evaluate()`` that are not numbers."""
     obs: Columns
+    drawings: Annotated[tuple[tuple[Name, DrawingKind], ...], Entries] | UnsetType = UNSET
+    """Name and kind of each drawing; missing if the task draws nothing."""
     # Only in the .json:
     files: dict[str, Checksum] | UnsetType = UNSET
     """Checksums of the other two files, by suffix."""

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraInfo, MovedCamera, PictureDegree
 from workbench.envs.scene.shapes import BodyKind, SceneGeometry
 from workbench.envs.step_result import OtherEntry
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.columns import TextTrack, entry_at
+from workbench.episodes.drawings import DrawingTrack
 from workbench.episodes.encoded_pictures import EncodedPictures, Modality
 from workbench.episodes.row import UnreadableRecording
 
@@ -211,6 +213,8 @@ class Episode:
     """(T + 1, ...) numbers that ``evaluate()`` returned for the whole batch."""
     texts: dict[str, TextTrack] = field(default_factory=dict)
     """Entries of ``evaluate()`` that are not numbers."""
+    drawn: tuple[DrawingTrack, ...] = ()
+    """What the task drew with `workbench.draw`."""
     broken_files: tuple[BrokenFile, ...] = ()
     """Set when read from a recording."""
 
@@ -265,6 +269,10 @@ class Episode:
             if entry is not None and (number is None or _is_nan(number.numbers)):
                 found[name] = OtherEntry(entry.what, (entry.text,), None, entry.per_env, entry.whole)
         return found
+
+    def drawings_at(self, state: int) -> dict[str, Drawing]:
+        """What the task drew, by name, as a batch of one env."""
+        return {track.name: drawing for track in self.drawn if (drawing := track.at(state)) is not None}
 
 
 def read_whole(name: str, read: Callable[[], Episode]) -> Episode:

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.envs.recorded_run import STATE, states_of
 from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.columns import BatchPacker
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.side_files import side_files
-from workbench.episodes.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
+from workbench.episodes.writing.episode_writer import NO_DRAWINGS, NO_OTHERS, EpisodeFiles, EpisodeWriter
 from workbench.episodes.writing.files_process import FilesProcess
 from workbench.episodes.writing.publish import RecordingError
 from workbench.jobs.pack_author_files import relocated
@@ -118,7 +119,8 @@ class GatheredEpisode:
             )
         batch = batch_columns(step, columns, self.state_names)
         layout, (packed,) = packer.pack([(name, values[row : row + 1]) for name, values in batch])
-        self.writer.append(layout, packed, _of_env(pictures, row), others_of(step.others, row))
+        others, drawn = others_of(step.others, row), _drawn_in(step.drawn, row)
+        self.writer.append(layout, packed, _of_env(pictures, row), others, drawn)
         self.steps += self.begun
         self.begun = True
 
@@ -255,7 +257,8 @@ class EpisodeGatherer:
                 episode.set_source(acted_by)
             if stepped.placed != episode.placed:
                 episode.set_placed(stepped.placed)
-            episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
+            drawn = _drawn_in(step.drawn, env)
+            episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env), drawn)
             episode.steps += 1
             episode.total_reward += reward[env]
             episode.success = None if success is None else success[env]
@@ -305,6 +308,10 @@ def _of_env(pictures: Sequence[Picture], env: int) -> Sequence[Picture]:
 def others_of(others: Mapping[str, OtherEntry], env: int) -> Mapping[str, OtherEntry]:
     """`StepResult.others` of one env."""
     return {name: entry.of_env(env) for name, entry in others.items()} if others else NO_OTHERS
+
+
+def _drawn_in(drawn: Mapping[str, Drawing], env: int) -> Mapping[str, Drawing]:
+    return {name: drawing.of_env(env) for name, drawing in drawn.items()} if drawn else NO_DRAWINGS
 
 
 def episode_info(

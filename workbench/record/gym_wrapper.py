@@ -8,6 +8,7 @@ import warnings
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from workbench.envs.maniskill_private import draws_its_own_seeds, last_observati
 from workbench.envs.simulation.stepping import usable_cores
 from workbench.envs.state_columns import StateReading, copy_states
 from workbench.envs.step_result import StepResult
+from workbench.envs.task_drawings import Drawing, drawings
 from workbench.envs.task_env import TaskEnv
 from workbench.episodes.episode import NO_SEED
 from workbench.episodes.reader.reading import recovered_text
@@ -137,6 +139,8 @@ class Recorder(gym.Wrapper):
         self._failure: Exception | None = None
         """Exception that gathering raised, perhaps on another thread."""
         before_writing(self._gather)
+        self._drawn: dict[str, Drawing] = {}
+        """What the env drew, by name."""
         self._scene: Any = None
         self._description: TaskDescription | None = None
         self._seeds = np.full(base.num_envs, NO_SEED, np.int64)
@@ -150,14 +154,16 @@ class Recorder(gym.Wrapper):
         return self._finisher.finished.count
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        obs, info = self.env.reset(seed=seed, options=options)
+        with self._drawings():
+            obs, info = self.env.reset(seed=seed, options=options)
         count = self._task.num_envs
         mask = np.zeros(count, bool)
         chosen = (options or {}).get("env_idx")
         mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
         self._seeds[mask] = self._seeds_of_reset(seed)[mask]
         self._task.obs, none = last_observation(self._task.env), np.zeros(count, bool)
-        step = self._task.result(info, np.zeros(count), None, none, none, look=False)
+        with self._drawings():
+            step = self._task.result(info, np.zeros(count), None, none, none, look=False)
         if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
         if self._gatherer is not None:
@@ -166,6 +172,9 @@ class Recorder(gym.Wrapper):
             self._gatherer.reset_options = other_options
         self._add_step(step, mask)
         return obs, info
+
+    def _drawings(self) -> AbstractContextManager[None]:
+        return nullcontext() if self._finished else drawings.taken_into(self._drawn)
 
     def _seeds_of_reset(self, seed: Any) -> np.ndarray:
         """(N,) seeds of a reset; NO_SEED for an env that was reset without a seed.
@@ -183,13 +192,15 @@ class Recorder(gym.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         task = self._task
         made = actions.to_flat_action(task.env, task.parts, action) if task.parts else None
-        given = self.env.step(action)
+        with self._drawings():
+            given = self.env.step(action)
         if self._gatherer is not None:
             obs, reward, terminated, truncated, info = given
             if made is None:
                 made = np.zeros((task.num_envs, 0), np.float32)
             task.obs = last_observation(task.env)
-            step = task.result(info, reward, made, terminated, truncated, look=False)
+            with self._drawings():
+                step = task.result(info, reward, made, terminated, truncated, look=False)
             self._add_step(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
 

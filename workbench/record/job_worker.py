@@ -32,6 +32,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.envs.recorded_run import RecordedRun, states_of
 from workbench.envs.state_columns import read_state_columns
 from workbench.envs.step_result import StepResult
+from workbench.envs.task_drawings import Drawing, drawings
 from workbench.episodes.recorded_state import state_distance
 from workbench.episodes.replay import restore_recorded
 from workbench.episodes.writing.episode_writer import EpisodeFiles
@@ -213,10 +214,13 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
                     f"{platform.node()} does not see the folder {folder} of this machine: give one that all machines of "
                     "the cluster share, or an address such as s3://bucket/folder"
                 )
-            opened = _opened(what, queue)
+            drawn: dict[str, Drawing] = {}
+            with drawings.taken_into(drawn):
+                opened = _opened(what, queue)
             try:
                 with _scratch(folder, what) as into:
-                    episodes = _Episodes(opened, what, here, into, runs, queue, setup.run, at * setup.stride)
+                    first = at * setup.stride
+                    episodes = _Episodes(opened, drawn, what, here, into, runs, queue, setup.run, first)
                     chunk = episodes.run(chunk or queue.next(), (at + 1) * setup.stride)
             finally:
                 opened.env.close()
@@ -274,6 +278,7 @@ class _Episodes:
     def __init__(
         self,
         opened: OpenedTask,
+        drawn: dict[str, Drawing],
         what: RecordOptions,
         here: CurrentFolder,
         folder: Path,
@@ -284,10 +289,12 @@ class _Episodes:
     ) -> None:
         """
         Args:
+            drawn: what the task drew while it was opened.
             run: as in `RecordSetup`.
             first: the item number of this recording's episode 0.
         """
         self._opened, self._what, self._given, self._queue = opened, what, given, queue
+        self._drawn = drawn
         self._run, self._first, self._folder = run, first, folder
         limit = what.max_steps or opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
         if not (given or what.max_steps or opened.description.max_episode_steps):
@@ -441,12 +448,13 @@ class _Episodes:
                 remove_uploaded_id(self._what.upload, env_id, seed, id)
             else:
                 remove_episode(self._folder, env_id, seed, id)
-        with blamed("reset", self._opened.loaded, task):
-            step = task.reset(seed, [env])
-        self._running[env], self._steps[env], self._succeeded[env] = number, 0, 0
-        self._began[env] = time.monotonic()
-        if given is not None and given.env_states:
-            step = self._correct_start(env, given, step)
+        with drawings.taken_into(self._drawn):  # without what the envs of rollouts draw
+            with blamed("reset", self._opened.loaded, task):
+                step = task.reset(seed, [env])
+            self._running[env], self._steps[env], self._succeeded[env] = number, 0, 0
+            self._began[env] = time.monotonic()
+            if given is not None and given.env_states:
+                step = self._correct_start(env, given, step)
         self._gatherer.acted_by = self._chooser.begin(env, seed, given)
         self._gatherer.next_id = id
         mask = np.zeros(task.num_envs, bool)
@@ -464,15 +472,16 @@ class _Episodes:
         """Take a control step in all envs, and end the finished episodes."""
         task, loaded = self._opened.env, self._opened.loaded
         action = self._chooser.next_action(task, {env: self._steps[env] for env in self._running})
-        with blamed("step", loaded, task):
-            step = task.step(action)
-        if self._what.use_env_states:
-            states = {
-                env: given.state(self._steps[env] + 1)
-                for env, number in self._running.items()
-                if (given := self._given_of(number)) is not None
-            }
-            step = restore_recorded(self._opened, states, action)
+        with drawings.taken_into(self._drawn):
+            with blamed("step", loaded, task):
+                step = task.step(action)
+            if self._what.use_env_states:
+                states = {
+                    env: given.state(self._steps[env] + 1)
+                    for env, number in self._running.items()
+                    if (given := self._given_of(number)) is not None
+                }
+                step = restore_recorded(self._opened, states, action)
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
         if self._planned is not None:

@@ -27,6 +27,7 @@ from workbench.page.scene.env_grid import (
     view_label,
 )
 from workbench.page.scene.frames import BodyFrames
+from workbench.page.scene.task_drawings import TaskDrawingsView
 from workbench.page.scene.viewpoint import View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.templates import colour, letter
 from workbench.review.commands import SelectRecording
@@ -199,6 +200,7 @@ class ReviewIn3D:
         self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MAX_NAMED)]
         self._choice = stage.choice
         self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
+        self._drawn = TaskDrawingsView(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
         """View that was drawn last. The review's present view may have other recordings."""
@@ -252,6 +254,8 @@ class ReviewIn3D:
         self._mark.draw(scene.layout, view.selected, shown=in_grid, name=caption(view, view.selected))
         self._draw_names(view, scene if in_grid else None)
         self._draw_frustums(view, scene, cameras, pictures)
+        drawn = view.opened[view.selected].episode.drawings_at(view.states[view.selected])
+        self._drawn.draw(drawn, 0, scene.layout.offsets[view.selected])
         self._frame_what_is_new(view, scene, in_grid)
         self._framing.frame_untouched(self._viewpoint)
 
@@ -266,6 +270,7 @@ class ReviewIn3D:
         self._body_mark.clear()
         self._frames.clear()
         self._frustums.clear()
+        self._drawn.draw({}, 0, np.zeros(3))
         self._draw_names(view, None)
         self._framing.is_new(None)
 

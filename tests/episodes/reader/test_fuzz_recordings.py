@@ -25,6 +25,7 @@ from tests.drive.rows import EpisodeRow, append
 from tests.episodes.foreign_h5 import write as write_h5
 from workbench.envs.camera_data import CameraInfo, Picture
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.episode import Episode, EpisodeInfo
 from workbench.episodes.lerobot.export import export_lerobot
 from workbench.episodes.reader import reading
@@ -79,6 +80,7 @@ def record(folder: Path) -> Path:
             action,
             0.1,
             pictures=(picture,),
+            drawn={"dot": Drawing("points", poses[None, :, :3]), "axes": Drawing("frames", poses[None])},
         )
         append(writer, row)
     return writer.finish().json

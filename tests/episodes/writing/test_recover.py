@@ -21,6 +21,7 @@ from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.episodes.refused_calls import descriptors, left_open, refused
 from workbench.envs.scene.shapes import Mesh
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.finish_or_recover import recover
 from workbench.episodes.writing.journal import FOLDER, Journal, JournalEntry
@@ -51,6 +52,11 @@ def test_a_killed_writer_loses_no_row_that_had_time_to_be_written(
     assert found.length == 5
 
 
+def dot(state: int) -> Drawing:
+    """A drawing that changes with every state."""
+    return Drawing("points", np.full((1, 1, 3), state, np.float32))
+
+
 SCHEMA_BYTES = 200
 """Length of a journal's schema, which precedes the data."""
 DAMAGE = st.one_of(
@@ -69,6 +75,7 @@ def test_a_truncated_or_changed_journal_gives_its_complete_states_or_is_kept(
     """A killed process truncates it; after a power failure it may have its full length but other content."""
     folder = Path(tempfile.mkdtemp(dir=tmp_path))
     episode = make_episode(6)
+    episode.drawn = [{"dot": dot(state)} for state in range(7)]
     writer = episode.writer(folder)
     ends = []
     for row in episode.rows():
@@ -109,6 +116,8 @@ def test_a_truncated_or_changed_journal_gives_its_complete_states_or_is_kept(
     for one in found if kind != "flip" else ():  # a journal has no checksums
         np.testing.assert_array_equal(one.poses, episode.poses[: states[0]])
         np.testing.assert_array_equal(one.action, episode.action[: states[0] - 1])
+        for state in range(states[0]):
+            np.testing.assert_array_equal(one.drawings_at(state)["dot"].data, dot(state).data)
 
 
 def test_a_journal_without_a_step_is_removed(make_episode: Maker, tmp_path: Path) -> None:
@@ -229,6 +238,11 @@ def of_a_missing_camera(make_episode: Maker, folder: Path) -> None:
     changed(path, "acted", lambda text: text, more=JournalEntry("camera/7", 0, bytes(28)))
 
 
+def of_no_drawing(make_episode: Maker, folder: Path) -> None:
+    path = left(make_episode(), folder, id="0")
+    changed(path, "acted", lambda text: text, more=JournalEntry("drawing", 0, b"\x93\xa1a\xa4blob\x90"))
+
+
 def of_another_version(make_episode: Maker, folder: Path) -> None:
     def further(text: bytes) -> bytes:
         header = json.loads(text)
@@ -255,7 +269,7 @@ def changed(
 
 @pytest.mark.parametrize(
     "broken",
-    [refused_by_rerun, not_a_state, of_a_missing_camera, of_another_version],
+    [refused_by_rerun, not_a_state, of_a_missing_camera, of_no_drawing, of_another_version],
 )
 def test_an_unrecoverable_journal_is_reported_and_kept_and_the_others_are_recovered(
     make_episode: Maker, tmp_path: Path, broken: Callable[[Maker, Path], None]

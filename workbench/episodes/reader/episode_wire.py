@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.episodes.columns import MAX_TEXT_LINES
 from workbench.episodes.document import CameraJson
+from workbench.episodes.drawings import wrong_drawings
 from workbench.episodes.encoded_pictures import MAX_PIXELS, EncodedPictures, LazyPictures, Modality
 from workbench.episodes.episode import BrokenFile, CameraTrack, Episode
 from workbench.episodes.reader.requests import CameraRead, EpisodeRead, PictureRead, ShapeRead, VisualRead
@@ -150,6 +151,8 @@ def unpack_episode(
     }
     action = _checked(episode.action, "actions", length, len(episode.action_names))
     _require(sum(map(len, episode.texts.values())) <= MAX_TEXT_LINES, "too many entries that are not numbers")
+    wrong = wrong_drawings(episode.drawn, length + 1)
+    _require(wrong is None, str(wrong))
     return replace(
         episode,
         geometry=geometry,

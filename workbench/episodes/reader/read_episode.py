@@ -25,12 +25,14 @@ from workbench.episodes.document import (
     read_document,
     task_file,
 )
+from workbench.episodes.drawings import wrong_drawings
 from workbench.episodes.encoded_pictures import EncodedPictures, Modality
 from workbench.episodes.episode import BrokenFile, CameraTrack, Episode
 from workbench.episodes.maniskill.read import leaves
 from workbench.episodes.maniskill.read import read_maniskill as read_maniskill
 from workbench.episodes.maniskill.safe_h5 import open_h5
 from workbench.episodes.maniskill.write import TRAJECTORY
+from workbench.episodes.rerun.drawings import read_drawings
 from workbench.episodes.rerun.entities import (
     CAMERAS,
     OBSERVATION,
@@ -200,6 +202,9 @@ def _episode(description: Description, table: RerunTable | None) -> Episode:
         _check_room("the poses", (states, len(entities), 7), np.dtype(np.float32))
         poses = table.poses(entities, states)
         cameras = list(_cameras(description.cameras, table, states))
+    drawn = () if table is None else tuple(read_drawings(table, description.drawings or ()))
+    if (wrong := wrong_drawings(drawn, states)) is not None:
+        raise ValueError(f"it has {wrong}")
     actions, number, flag = ("<f4", (len(description.action_names),)), ("<f4", ()), ("|b1", ())
     return Episode(
         info=description.info(),
@@ -215,6 +220,7 @@ def _episode(description: Description, table: RerunTable | None) -> Episode:
         cameras=cameras,
         batch=_columns(table, description.batch, batch_entity, states),
         texts=description.texts,
+        drawn=drawn,
     )
 
 

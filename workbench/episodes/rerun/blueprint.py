@@ -11,6 +11,7 @@ import rerun.blueprint as rrb
 from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.episode import Episode, movable_bounds
 from workbench.episodes.rerun.chunks import STEP
+from workbench.episodes.rerun.drawings import DRAWINGS
 from workbench.episodes.rerun.entities import (
     EVENTS,
     LOGS,
@@ -40,6 +41,8 @@ class Arrangement:
     """Entities of ``evaluate()`` that are drawn as curves."""
     texts: bool
     """Whether ``evaluate()`` returned texts."""
+    drawings: bool
+    """Whether the task drew anything."""
     acted: bool
     """Whether there are actions to draw."""
     fps: float | None
@@ -64,6 +67,7 @@ def arrangement(episode: Episode) -> Arrangement:
         ),
         drawn=tuple(drawn),
         texts=bool(episode.texts),
+        drawings=bool(episode.drawn),
         acted=bool(episode.action_names),
         fps=1.0 / episode.info.control_dt if episode.info.control_dt > 0 else None,
         eye=eye,
@@ -82,6 +86,7 @@ def blueprint_of(arranged: Arrangement) -> rrb.Blueprint:
         # Without depth and segmentation: in a 3-D view a depth picture is a point cloud over the meshes.
         contents=[
             "$origin/**",
+            *([f"{DRAWINGS}/**"] if arranged.drawings else []),
             *(f"- {entity}/{m}" for _, entity, _ in arranged.cameras for m in ("depth", "segmentation")),
         ],
         eye_controls=rrb.EyeControls3D(

@@ -104,6 +104,12 @@ class _Column:
         return self.values
 
 
+def lists_column(name: str, numbers: NDArray, counts: NDArray[np.int64]) -> _Column:
+    """A component of the workbench's own: row r has ``counts[r]`` of the `numbers` (sum of counts,)."""
+    offsets = pa.array(np.cumsum([0, *counts], dtype=np.int32))
+    return _Column(rr.ComponentDescriptor(name), pa.ListArray.from_arrays(offsets, pa.array(numbers)))
+
+
 @cache
 def _pose_columns() -> tuple[tuple[rr.ComponentDescriptor, pa.DataType], ...]:
     one = rr.Transform3D.columns(translation=np.zeros((1, 3)), quaternion=np.zeros((1, 4)))

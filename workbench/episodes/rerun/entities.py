@@ -27,6 +27,7 @@ from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode
 from workbench.episodes.episode import CameraTrack, Episode, camera_names
 from workbench.episodes.rerun.chunks import LOOK, TimedChunks, series_chunk, static_chunk, static_pose
+from workbench.episodes.rerun.drawings import drawing_chunks
 
 WORLD = "/world"
 CAMERAS = "/world/cameras"
@@ -59,7 +60,8 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
     - ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/batch/<entry>`` for numbers that
       ``evaluate()`` returned without a row per env, ``/observation/state``,
-      ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text.
+      ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text;
+    - ``/drawings/<kind>/<name>`` what the task drew (`rerun.drawings`).
 
     Timelines are ``step``, the state's number, and ``sim_time``. Row k is the state after k control steps, with the
     action that led to it and its reward: the action of row k is ``episode.action[k - 1]``, and row 0 has
@@ -94,6 +96,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
     yield timed.texts(EVENTS, events(episode))
     if episode.texts:
         yield timed.texts(ENTRY_TEXTS, _texts(episode))
+    yield from drawing_chunks(episode.drawn, timed)
     states = np.arange(len(poses), dtype=np.int64)
     moving = {body: entity for body, entity in bodies.items() if not still[body]}
     yield from timed.poses(list(moving.values()), states, poses[:, list(moving)][..., _XYZW])

@@ -150,6 +150,17 @@ class RerunTable:
         order = np.argsort(steps, kind="stable")
         return steps[order], values[order]
 
+    def lists(self, entity: str, component: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray]:
+        """Steps (R,) of the rows of a component, (R + 1,) index at which each row begins, and all plain values."""
+        found = self._timed.get((entity, component), [])
+        if not found:
+            return np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0)
+        steps = np.concatenate([steps for steps, _ in found])
+        order = np.argsort(steps, kind="stable")
+        column = pa.concat_arrays([column for _, column in found]).take(pa.array(order))
+        counts = column.value_lengths().fill_null(0).to_numpy()
+        return steps[order], np.cumsum([0, *counts], dtype=np.int64), _plain(column.flatten())
+
     def pictures(
         self, entity: str, modality: Modality, info: CameraInfo
     ) -> tuple[NDArray[np.int64], EncodedPictures] | None:

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, MovedCamera, Picture
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import OtherEntry
+from workbench.envs.task_drawings import Drawing
 from workbench.episodes.columns import TEXT, Layout, TextWriter
+from workbench.episodes.drawings import DRAWING, DrawingWriter
 from workbench.episodes.encoded_pictures import Modality, encode
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.writing.files_process import FilesProcess
@@ -36,6 +38,7 @@ from workbench.episodes.writing.journal import (
 from workbench.episodes.writing.publish import RecordingError, reason
 
 NO_OTHERS: Mapping[str, OtherEntry] = MappingProxyType({})
+NO_DRAWINGS: Mapping[str, Drawing] = MappingProxyType({})
 _PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
     "rgb": ((3,), "u", "(H, W, 3) of uint8"),
     "depth": ((), "fi", "(H, W) of numbers"),
@@ -76,7 +79,7 @@ class EpisodeWriter:
         }
         self._given: dict[int, tuple[Modality, ...]] = {}
         self._layouts: dict[Layout, int] = {}
-        self._texts = TextWriter()
+        self._texts, self._drawn = TextWriter(), DrawingWriter()
         self._states = 0
         self._finished: EpisodeFiles | None = None
         path = self._folder / FOLDER / f"{info.id}.arrow"
@@ -115,6 +118,7 @@ class EpisodeWriter:
         row: bytes,
         pictures: Sequence[Picture] = (),
         others: Mapping[str, OtherEntry] = NO_OTHERS,
+        drawn: Mapping[str, Drawing] = NO_DRAWINGS,
     ) -> None:
         """Add a state as packed by `BatchPacker`: the first call adds the state after the reset, each later
         call a state with the action that led to it.
@@ -123,6 +127,7 @@ class EpisodeWriter:
             pictures: pictures of this env alone; later pictures of a camera must have the modalities of its
                 first picture. The pictures are encoded in the background: do not modify them afterwards.
             others: `StepResult.others`, each entry as returned by `OtherEntry.of_env`.
+            drawn: `StepResult.drawn`, each drawing as returned by `Drawing.of_env`.
 
         Raises:
             ValueError: the row does not fit the episode, which is unchanged.
@@ -141,6 +146,7 @@ class EpisodeWriter:
             items += encoded
         if others or not self._texts.is_empty:
             items += [JournalEntry(TEXT, *line) for line in self._texts.changes(self._states, others)]
+        items += [JournalEntry(DRAWING, *line) for line in self._drawn.changes(self._states, drawn)]
         try:
             self._journal.append(*items, JournalEntry("row", number, row))
         except OSError as error:

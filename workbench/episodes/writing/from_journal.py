@@ -15,6 +15,7 @@ from workbench.envs.camera_data import CameraInfo, MovedCamera
 from workbench.envs.scene.shapes import SceneGeometry, Visual
 from workbench.episodes.columns import BATCH, EVALUATE, OBS, STATE, TEXT, assemble, layout_type, text_tracks
 from workbench.episodes.document import CameraJson, SceneJson, json_text
+from workbench.episodes.drawings import DRAWING, drawing_tracks
 from workbench.episodes.encoded_pictures import MODALITIES, EncodedPictures, LazyPictures, Modality
 from workbench.episodes.episode import CameraTrack, Episode, EpisodeInfo, parse_acted_by
 from workbench.episodes.seal import is_sealed, seal_text
@@ -131,6 +132,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
     acted = list(header.info.acted_by)
     placed: list[MovedCamera] = []
     texts: list[tuple[int, bytes]] = []
+    drawn: list[tuple[int, bytes]] = []
     for place, (kind, number, value) in _complete_states(journal):
         if kind == "row":
             if not runs or runs[-1][0] != number:
@@ -144,6 +146,8 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
             placed.append(msgspec.json.decode(value, type=MovedCamera))
         elif kind == TEXT:
             texts.append((number, value))
+        elif kind == DRAWING:
+            drawn.append((number, value))
         elif kind.startswith("camera/"):
             camera = seen[int(kind[7:])]
             camera.frames.append(number)
@@ -176,6 +180,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
         obs=named(OBS),
         batch=named(BATCH),
         texts=text_tracks(texts),
+        drawn=drawing_tracks(drawn),
     )
 
 

@@ -67,6 +67,7 @@ class Journal:
     - ``acted`` `action`: source of the actions from this number on, if it differs from the header's;
     - ``placed`` `state`: JSON of a camera that was placed by hand, from this state on (`MovedCamera`);
     - ``entry`` `state`: JSON of an entry of ``evaluate()`` that is not a number and changes here (`columns.TextWriter`);
+    - ``drawing`` `state`: msgpack of a drawing that changes here (`drawings.DrawingWriter`);
     - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 
     One thread writes all journals of the process every `SYNC_SECONDS`, another one syncs them. The file is locked (``flock``)

@@ -31,10 +31,10 @@ class TaskDrawingsView:
         for name in self._nodes.keys() - drawn.keys():
             self._remove(name)
         for name, drawing in drawn.items():
-            data = drawing.data[env]
-            data = data[np.isfinite(data).all(axis=tuple(range(1, data.ndim)))].copy()
+            drawing = drawing.of_env(env)
+            data = drawing.data[0].copy()
             data[..., :3] += np.asarray(offset, np.float32)
-            text = drawing.texts[env] if drawing.texts else ""
+            text = drawing.texts[0] if drawing.texts else ""
             shown = hash((drawing.kind, text)), data.tobytes()
             looks = (drawing.kind, drawing.color, drawing.size, len(data))
             if self._shown.get(name) == shown and name in self._nodes and self._nodes[name][0] == looks:
