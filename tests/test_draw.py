@@ -15,11 +15,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import workbench
+from tests.drive.envs import CPU
 from tests.drive.panels import Panels
 from tests.drive.session import live_session, moment_at, save, start_over, step, wait_until
 from workbench import draw
 from workbench.envs.task_drawings import Drawing, TaskDrawings, drawings
+from workbench.episodes.reader.read_episode import read_episode
 from workbench.page.scene.task_drawings import TaskDrawingsView
+from workbench.planning.options import PlanOptions
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
 
 TASK = """
 import torch
@@ -81,6 +88,49 @@ def test_each_moment_keeps_what_was_drawn_then(child_process: None, tmp_path: Pa
         file.write_text(wrong)
         view = wait_until(session, lambda v: v.problem is not None, "the problem")
         assert view.problem.line == wrong[: wrong.index('draw.points("cube"')].count("\n") + 1
+
+
+@pytest.mark.parametrize("actions", ["random", "solve"])
+def test_a_recording_from_the_terminal_has_its_own_envs_drawings(
+    child_process: None, tmp_path: Path, actions: str
+) -> None:
+    """The envs of a plan's rollouts draw too, and are no part of the recording."""
+    (tmp_path / "task.py").write_text(TASK)
+    options = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
+    plan = PlanOptions(rollouts=4, horizon=0.1)
+    done = record(
+        RecordOptions(
+            str(tmp_path / "task.py"), tmp_path, 2, actions=actions, max_steps=3, options=options, plan=plan
+        )
+    )
+    for written in done.written:
+        episode = read_episode(written.path)
+        assert episode.geometry is not None and episode.poses is not None
+        cube = episode.poses[:, episode.geometry.body_names.index("cube"), :3]
+        for state in range(4):
+            drawn = episode.drawings_at(state)
+            assert drawn.keys() == {"spawn", "cube", "to goal", "height"}
+            np.testing.assert_allclose(drawn["cube"].data[0], cube[state : state + 1], atol=1e-6)
+            np.testing.assert_allclose(drawn["spawn"].data[0, :, :3], cube[:1], atol=1e-6)
+    assert len(done.written) == 2 and not drawings.on
+
+
+def test_a_recorder_takes_the_drawings_of_its_own_env(tmp_path: Path) -> None:
+    (tmp_path / "task.py").write_text(TASK)
+    env = workbench.Recorder(workbench.make(str(tmp_path / "task.py"), 2, **CPU), tmp_path / "out")
+    other = workbench.make(str(tmp_path / "task.py"), 2, **CPU)
+    env.reset(seed=[1, 2])
+    for _ in range(2):
+        other.reset(seed=[3, 4])
+        env.step(env.action_space.sample())
+    env.close()
+    other.close()
+    paths = sorted((tmp_path / "out").glob("*.json"))
+    for episode in map(read_episode, paths):
+        assert episode.geometry is not None and episode.poses is not None
+        start = episode.poses[0, episode.geometry.body_names.index("cube"), :3]
+        np.testing.assert_allclose(episode.drawings_at(2)["spawn"].data[0, 0, :3], start, atol=1e-6)
+    assert len(paths) == 2
 
 
 @given(st.lists(st.tuples(st.booleans(), st.sets(st.integers(0, 4)), st.integers(1, 3)), max_size=8))
