@@ -19,9 +19,10 @@
 //                                            option is chosen, or (data-live) on every input; Enter sends data-enter
 //     data-done="set_joint"                    command, with the same fields, for the value at the end of a slider's drag
 //     data-number="[0, null, 1, true]"         a number: minimum, maximum, step of an arrow key, whether it is an integer
-//   data-drive='["drive_robot", "keys", ["w"], "axes", "buttons"]'  while this element is in the page, these keys drive: the
+//   data-drive='["drive_robot", "keys", ["w"], "axes", "buttons", {"3": "keep_episode"}]'  while this element is in the page, these keys drive: the
 //                                            command's field has the held ones, sent when they change and every 100 ms; the last
-//                                            two fields have the deflections of a gamepad, sent every 50 ms while one is held.
+//                                            two fields have the deflections of a gamepad, sent every 50 ms while one is held;
+//                                            the commands by button are sent when that button is pressed.
 //                                            <html> has data-gamepad while the browser reports a gamepad of the standard layout
 //   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrow keys from it
 //                                            into the list, starting at data-best
@@ -329,6 +330,7 @@
 
   const PAD_BEAT = 50; // milliseconds between readings of the gamepad
   const REST = 0.1; // deflection up to which a stick or button counts as released
+  const PRESSED_BY = 0.5; // deflection from which a button counts as pressed
   let pad = null; // deflections while one is held
   let padBeat = 0;
 
@@ -343,6 +345,10 @@
     // Another window may be in front: what is held there is not meant for the robot.
     const isHeld = document.hasFocus() && [...axes, ...buttons].some((value) => Math.abs(value) > REST);
     pad = isHeld ? { axes, buttons } : null;
+    const presses = pad ? JSON.parse(driving.dataset.drive)[5] : {};
+    for (const [button, command] of Object.entries(presses)) {
+      if (pad.buttons[button] > PRESSED_BY && !(was?.buttons[button] > PRESSED_BY)) send([command, {}]);
+    }
     if (pad || was) reportHeld();
     if (!driving) padBeat = clearInterval(padBeat);
   }

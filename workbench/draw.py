@@ -6,7 +6,7 @@
 >>> draw.frames("spawn", pose, env_idx=env_idx)                   # in _initialize_episode: only these envs
 
 Positions are in the frame of each env, in metres. The first dimension is the env: (N, ...), or (len(env_idx), ...) with
-`env_idx`. A drawing stays until one of the same name replaces it; past moments show what was drawn then.
+`env_idx`. A drawing stays until one of the same name replaces it; past moments and recordings show what was drawn then.
 """
 
 from __future__ import annotations

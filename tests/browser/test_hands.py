@@ -109,6 +109,8 @@ def test_a_gamepad_moves_the_hand_only_while_a_person_drives(desk: Desk) -> None
     assert position(desk)[2] == pytest.approx(height, abs=0.005), "a released stick holds still"
     desk.tab("Run")
     expect(page.get_by_text("gamepad connected")).to_be_visible()
+    page.evaluate("pad.buttons[2].value = 1")
+    expect(page.get_by_text("was discarded")).to_be_visible()
     page.evaluate("navigator.getGamepads = () => []")
     expect(page.get_by_text("gamepad connected")).to_be_hidden()
     desk.press("k")

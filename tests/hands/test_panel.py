@@ -175,6 +175,8 @@ def test_a_driver_sees_the_keys_and_the_set_and_ends_episodes_by_buttons(live_pa
     text = words_of(live_page.part("Run").html())
     for words in ("seed 3 (40 steps) is kept", "2 kept, 1 with success, 1 being saved", "W / S", "arm/x"):
         assert words in text
+    for row in ("CYkeep", "XXdiscard", "ZBagain"):
+        assert row in "".join(text.split())
     for command in (KeepEpisode(), DiscardEpisode(), BeginAgain()):
         live_page.do(command)
     assert live_page.asked[-3:] == [KeepEpisode(), DiscardEpisode(), BeginAgain()]

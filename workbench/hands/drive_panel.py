@@ -17,7 +17,7 @@ from workbench.hands.commands import (
     ToggleReach,
 )
 from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, KeyBinding, bindings, gripper
-from workbench.hands.gamepad import GRIPPER_LABEL, LABELS, pad_amounts, pad_grips
+from workbench.hands.gamepad import GRIPPER_LABEL, LABELS, B, X, Y, pad_amounts, pad_grips
 from workbench.hands.reach import why_no_arm
 from workbench.hands.state import Driven, Hands
 from workbench.live.session_protocol import LiveSession
@@ -30,8 +30,8 @@ from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 from workbench.record.state import RecordingStatus
 
-SET = (("Keep", KeepEpisode()), ("Discard", DiscardEpisode()), ("Again", BeginAgain()))
-"""Buttons that end the driven episode."""
+SET = (("Keep", KeepEpisode(), Y), ("Discard", DiscardEpisode(), X), ("Again", BeginAgain(), B))
+"""Label, command and gamepad button of what ends the driven episode."""
 
 
 class DrivePanel(PagePart[SessionView]):
@@ -72,7 +72,7 @@ class DrivePanel(PagePart[SessionView]):
             off=view.task is None or bool(armless),
         )
         rows = _rows(bindings(actions), bool(gripper(actions))) if driving else []
-        of_set = [tool(name, command) for name, command in SET] if driving else []
+        of_set = [tool(name, command) for name, command, _ in SET] if driving else []
         self._html.content = tools_html([button, reach], of_set) + render(
             "drive_keys", rows=rows, note=hands.note, kept=view.of(RecordingStatus).kept
         )
@@ -101,10 +101,11 @@ class DrivingSign(PagePart[SessionView]):
         driving = view.of(Hands).driving and view.task is not None
         self._html.visible = driving
         if driving:
+            presses = {button: name_of(type(command)) for _, command, (button, _) in SET}
             self._html.content = render(
                 "driving",
                 env=view.selected_env,
-                drives=json.dumps([name_of(DriveRobot), "keys", KEYS, "axes", "buttons"]),
+                drives=json.dumps([name_of(DriveRobot), "keys", KEYS, "axes", "buttons", presses]),
                 stop=ToggleDriving(),
                 hint=with_key(ToggleDriving),
             )
@@ -122,10 +123,11 @@ def yaw_of(wxyz: Sequence[float] | np.ndarray) -> float:
 
 
 def _rows(bound: Sequence[KeyBinding], has_gripper: bool) -> list[tuple[str, str, str]]:
-    """Rows of the list: keys, gamepad controls, and the number of the action that both drive."""
+    """Rows of the list: keys, gamepad controls, and what both do."""
     rows = [
         (f"{key_in_words(one.raises, SHORT_NAMES)} / {key_in_words(one.lowers, SHORT_NAMES)}", pad, one.name)
         for one, pad in zip(bound, LABELS, strict=False)
     ]
     grip = key_in_words(GRIPPER_KEY), GRIPPER_LABEL, "gripper"
-    return [*rows, grip] if has_gripper else rows
+    ends = [(key_in_words(command.key), pad, name.lower()) for name, command, (_, pad) in SET]
+    return [*rows, *([grip] if has_gripper else []), *ends]

@@ -17,6 +17,8 @@ LABELS = (
 )
 """The controls that raise and lower the numbers of the action, in the order of `drive_keys.PAIRS`."""
 GRIPPER_LABEL = "A"
+B, X, Y = (1, "B"), (2, "X"), (3, "Y")
+"""Index and label of the buttons that end the episode (`drive_panel.SET`)."""
 _LEFT_X, _LEFT_Y, _RIGHT_X, _RIGHT_Y = range(4)
 """Indices of the axes; right and down are positive."""
 _A, _LB, _RB, _LT, _RT, _UP, _DOWN, _LEFT, _RIGHT = 0, 4, 5, 6, 7, 12, 13, 14, 15
