@@ -29,7 +29,7 @@ def choose(desk: Desk, label: str, option: str, of: str = "") -> None:
 
 def select(desk: Desk, body: str) -> None:
     desk.tab("Inspect")
-    choose(desk, "Show", "poses", of="choose_inspected")
+    choose(desk, "Show", "bodies", of="choose_inspected")
     desk.page.get_by_text(body, exact=True).first.click()
     expect(desk.page.locator(".wb-body b").first).to_have_text(body)
 
