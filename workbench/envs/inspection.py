@@ -66,6 +66,16 @@ class Touching:
 
 
 @dataclass(frozen=True)
+class Overlap:
+    """Two bodies inside each other."""
+
+    bodies: tuple[str, str]
+    """Names as in `SceneIndex.names`."""
+    depth: float
+    """Metres."""
+
+
+@dataclass(frozen=True)
 class LinkJoint:
     """The joint that moves a link against its parent."""
 

@@ -34,10 +34,11 @@ from workbench.envs.broken_rule import BrokenRules, Place
 from workbench.envs.cpu_scene import BatchedCpuMixin
 from workbench.envs.evaluate_entries import flat_entries
 from workbench.envs.gpu_rules import Degree, Finding
-from workbench.envs.inspect_env import list_contacts
+from workbench.envs.inspection import Overlap
 from workbench.envs.keywords import constructor_arguments
-from workbench.envs.maniskill_private import apply_and_fetch, fetch
+from workbench.envs.maniskill_private import apply_and_fetch
 from workbench.envs.outliers import OutlierWatch
+from workbench.envs.overlaps import first_substep, overlaps_of
 from workbench.envs.scene.read_scene import read_geometry
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.scene.shapes import SceneGeometry
@@ -106,16 +107,6 @@ def evidence(see: Callable[[Checkup], _Value]) -> cached_property[_Value]:
         return self._once(see)
 
     return cached_property(once)
-
-
-@dataclass(frozen=True)
-class Overlap:
-    """Two bodies inside each other."""
-
-    bodies: tuple[str, str]
-    """Names as in `SceneIndex.names`."""
-    depth: float
-    """Metres."""
 
 
 @dataclass(frozen=True)
@@ -441,7 +432,7 @@ class Checkup:
             self.reset(self.task, seeds)
             self.first_substep(self.task)
             found |= {
-                seed: overlaps_of(self.task, env) for env, seed in enumerate(seeds) if seed in self.seeds
+                seed: overlaps_of(self.task.env, env) for env, seed in enumerate(seeds) if seed in self.seeds
             }
         return found
 
@@ -477,7 +468,7 @@ class Checkup:
                 shapes[seed] = shapes_of_env(built, 0)
             put_where_built(task)
             self.first_substep(task)
-            return Alone(shapes, rebuilds, overlaps_of(task, 0), tuple(seeds))
+            return Alone(shapes, rebuilds, overlaps_of(task.env, 0), tuple(seeds))
 
     @evidence
     def fails_with_several(self) -> Problem | None:
@@ -515,8 +506,7 @@ class Checkup:
     def first_substep(self, task: TaskEnv) -> None:
         """Make one substep of physics. Its contacts are those of the state before the substep."""
         with blamed("step", self.loaded, task):
-            task.env.scene.step()
-            fetch(task.env)
+            first_substep(task.env)
 
     def _episodes(self, actor: Actor, watched: bool = False) -> Episodes:
         together: list[Episodes] = []
@@ -603,20 +593,6 @@ def leaf_rows(value: Any, num_envs: int) -> dict[str, NDArray[np.float64]]:
         if leaf.numel() <= MAX_LEAF_NUMBERS * num_envs and not leaf.is_complex():
             read[name or "obs"] = leaf.reshape(num_envs, -1).double().numpy(force=True).copy()
     return read
-
-
-def overlaps_of(task: TaskEnv, env: int) -> tuple[Overlap, ...]:
-    """Bodies that overlapped at the start of the last substep, deepest first. Links of one articulation that touch are left out,
-    since joints hold them."""
-    deepest: dict[tuple[str, str], float] = {}
-    for contact in list_contacts(task.env, env):
-        first, second = sorted(contact.bodies)
-        if first.split("/")[0] == second.split("/")[0] and "/" in first:
-            continue
-        depth = -float(contact.separations.min(initial=0.0))
-        if depth > deepest.get((first, second), 0.0):
-            deepest[first, second] = depth
-    return tuple(Overlap(pair, depth) for pair, depth in sorted(deepest.items(), key=lambda item: -item[1]))
 
 
 def finding_of(rule: str, degree: Degree, found: Found) -> Finding:

@@ -20,12 +20,11 @@ from workbench.checks.results import Seen
 from workbench.envs.action_vector import random_action
 from workbench.envs.broken_rule import Place
 from workbench.envs.maniskill_private import agents, apply_and_fetch, objects_of
-from workbench.envs.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
+from workbench.envs.overlaps import OVERLAP_METRES, immovable
+from workbench.envs.scene.scene_index import joints_of_scene, present_states, scene_index
 from workbench.machine.text import listed, of
 from workbench.task.problem import TaskError
 
-OVERLAP_METRES = 0.002
-"""Depth in metres that two bodies may overlap: contacts of bodies at rest are about that deep."""
 MOVED_METRES, TURNED_RADIANS = 0.02, 0.35
 """Metres that a body may move and radians that it may turn in a second: a body that is put down 1 cm above
 the table may settle."""
@@ -46,7 +45,7 @@ _REORDERED = ("roll", "scalar_first", "wxyz", "[3, 0, 1, 2]", "xyzw")
 
 def see_overlaps_at_reset(checkup: Checkup) -> Iterator[Seen]:
     """A row for each pair of bodies that overlaps after a reset."""
-    fixed = immovable(checkup)
+    fixed = immovable(checkup.task.env)
     seeds_of: dict[tuple[str, str], list[int]] = {}
     depths: dict[tuple[str, str], float] = {}
     for seed, overlaps in checkup.overlaps.items():
@@ -686,20 +685,3 @@ def _touched(checkup: Checkup, robots: set[str]) -> set[str]:
 def _is_fixed(articulation: Any) -> bool:
     """Whether the root link cannot move."""
     return all(each.links[0].joint.type == "fixed" for each in objects_of(articulation))
-
-
-def immovable(checkup: Checkup) -> set[str]:
-    """Names of the bodies that no contact moves: static and kinematic bodies, and links that only fixed
-    joints connect to a fixed root."""
-    index: SceneIndex = scene_index(checkup.task.env)
-    found = {
-        name for name, kind in zip(index.names, index.kinds, strict=True) if kind in ("static", "kinematic")
-    }
-    for articulation in checkup.task.env.scene.articulations.values():
-        for link in objects_of(articulation)[0].links:
-            name, above = index.name_of(link), link
-            while above is not None and above.joint.type == "fixed":
-                above = above.parent
-            if name is not None and above is None:
-                found.add(name)
-    return found

@@ -17,9 +17,9 @@ from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.checks.evidence.over_seeds import together, tried
 from workbench.checks.register_rule import rule
 from workbench.checks.results import Seen
-from workbench.checks.rules.placement import immovable
 from workbench.envs.broken_rule import Place
 from workbench.envs.maniskill_private import envs_of, named_to_hide, objects_of
+from workbench.envs.overlaps import immovable
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
@@ -130,7 +130,7 @@ def _stay_at_origin(checkup: Checkup) -> set[str]:
     """Evidence: names of the bodies that no contact moves and that are at the origin after a reset."""
     task = checkup.task
     checkup.reset(task, next(checkup.batches()))
-    index, fixed = scene_index(task.env), immovable(checkup)
+    index, fixed = scene_index(task.env), immovable(checkup.task.env)
     moved = {owner for owner, name in zip(index.owners, index.names, strict=True) if name not in fixed}
     structs = {**task.env.scene.actors, **task.env.scene.articulations}
     origin = np.array([0, 0, 0, 1, 0, 0, 0])
@@ -182,7 +182,7 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     unposed = {each.name for each in builds if _is_unposed(checkup, each)}
     unposed |= {str(merge.name) for merge in _merges(checkup) if not unposed.isdisjoint(merge.parts)}
     places = {each.name: each.place for each in builds}
-    fixed = immovable(checkup)
+    fixed = immovable(checkup.task.env)
     for overlap in checkup.alone.overlaps:
         owners = [body.split("/", 1)[0] for body in overlap.bodies]
         harmless = overlap.depth < OVERLAP_METRES or fixed.issuperset(overlap.bodies)
