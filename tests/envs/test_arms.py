@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosControllerConfig
 from mani_skill.agents.robots import Panda
 
 from tests.drive.envs import batched
 from workbench.envs.action_vector import hold_action
-from workbench.envs.arms import Arm, find_arms, solve, steer, without_arms
-from workbench.envs.maniskill_private import objects_of
+from workbench.envs.arms import Arm, find_arms, reaches, solve, steer, without_arms
+from workbench.envs.maniskill_private import apply_and_fetch, objects_of
 from workbench.envs.task_env import TaskEnv
 
 ENV = 1
@@ -140,3 +141,21 @@ def test_an_arm_holds_still_in_the_mode_of_absolute_poses() -> None:
     for _ in range(20):
         task.step(held)
     assert apart(tool(arm), before) < 2e-3
+
+
+@pytest.mark.parametrize("robot", ["panda", "fetch", "so100"])
+def test_an_arm_reaches_where_joints_within_the_limits_bring_it_and_not_farther(robot: str) -> None:
+    task = opened(robot, "pd_joint_pos")
+    (arm,) = find_arms(task.env)
+    own, rng, start = list(arm.joints), np.random.default_rng(0), tool(arm)[:3]
+    low, high = np.clip(arm.limits(ENV)[own].T, -3, 3)
+    points = []
+    for _ in range(20):
+        qpos = arm.articulation.get_qpos()
+        qpos[ENV, own] = torch.as_tensor(rng.uniform(low, high), dtype=torch.float32)
+        arm.articulation.set_qpos(qpos)
+        apply_and_fetch(task.env)
+        points.append(tool(arm)[:3])
+    task.reset(0)
+    assert reaches(arm, ENV, np.array(points)).all()
+    assert not reaches(arm, ENV, start + np.array([[0, 0, 9.0], [0, 0, -9.0]])).any()

@@ -6,7 +6,7 @@ CPU. They need no URDF and work for one env at a time on any device.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,13 +38,18 @@ MIN_JOINTS = 3
 _ITERATIONS, _STEP = 40, 0.25
 """Iterations of one run of the solver, and share of the error that each iteration removes. The solver ignores
 the joint limits: the result of a run is clipped to them, and the next run starts from there."""
-_RUNS, _RUNS_FOR_POSITION = 3, 10
-"""Maximum number of runs for the whole pose, and for the position alone."""
+_RUNS = 3
+"""Maximum number of runs."""
+_STEPS_TO_POSITION, _STEP_METRES, _DAMPING = 100, 0.15, 0.01
+"""Maximum number of steps to a position, their length, and the damping in metres for each radian: near a stretched
+arm, steps without damping would be huge."""
+_STALLED_STEPS, _STALLED_METRES = 10, 1e-4
+"""The steps end if the last of them brought the end effector less than this nearer to the position."""
 _OTHER_STARTS = 6
 """Number of other joint positions from which the solver starts if it finds nothing from the present ones."""
 _HALVINGS = 7
 """Number of bisections of the line to a target that is out of reach."""
-_ORIGIN = np.zeros(3)
+_ORIGIN, _NO_TURN = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
 _AT_LIMIT = 1e-3
 """Distance from a limit, in rad or m, below which a joint counts as being at the limit."""
 _VELOCITY_GAIN = 0.25
@@ -190,24 +195,43 @@ def solve(arm: Arm, env: int, target: Floats) -> ArmPose:
         env: an env that has the robot.
         target: (7,) position and quaternion wxyz in the env's frame.
     """
-    row = arm.row(env)
-    assert row is not None, "the env has the robot"
-    body = maniskill_private.objects_of(arm.articulation)[row]
-    if env not in arm.models:
-        arm.models[env] = body.create_pinocchio_model()
-    root = _pose(arm.articulation.pose.raw_pose[row])
+    chain, root = _chain(arm, env)
     wanted = root.inv() * _pose_of(target[:3], target[3:] / np.linalg.norm(target[3:]))
-    qpos, limits = arm.qpos(env), arm.limits(env)
-    chain = _Chain(arm.models[env], maniskill_private.objects_of(arm.link)[row].index, arm.joints, limits)
+    qpos, limits = arm.qpos(env), chain.limits
     starts = [qpos, *chain.other_starts(qpos)]
-    solutions = (chain.solve(q, wanted, turns) for turns in (True, False) for q in starts)
-    found = next((one for one in solutions if one is not None), None)
+    found = chain.solve(starts, wanted)
     if found is None:
         found = chain.approach(qpos, wanted)
     metres, degrees = left = _apart(chain.pose(found), wanted)
-    poses = [root * chain.model.get_link_pose(k) for k in range(len(body.links))]
+    poses = [root * chain.model.get_link_pose(k) for k in range(len(arm.articulation.links))]
     why = "" if _is_near(left) else _why_not(arm, found, limits, left)
     return ArmPose(found, np.array([[*p.p, *p.q] for p in poses], np.float32), metres, degrees, why)
+
+
+def reaches(arm: Arm, env: int, points: Floats) -> NDArray[np.bool_]:
+    """(K,) whether the end effector can be at each point, in any rotation, within the limits of the joints. Collisions
+    are not considered.
+
+    Args:
+        env: an env that has the robot.
+        points: (K, 3) in the env's frame.
+    """
+    chain, root = _chain(arm, env)
+    qpos, to_root = arm.qpos(env), root.inv()
+    starts = [qpos, *chain.other_starts(qpos)]
+    goals = [to_root * _pose_of(point, _NO_TURN) for point in points]
+    return np.array([any(chain.to_position(q, goal) is not None for q in starts) for goal in goals], bool)
+
+
+def _chain(arm: Arm, env: int) -> tuple[_Chain, Pose]:
+    """The chain of the arm in an env that has the robot, and the pose of the articulation's root."""
+    row = arm.row(env)
+    assert row is not None, "the env has the robot"
+    if env not in arm.models:
+        arm.models[env] = maniskill_private.objects_of(arm.articulation)[row].create_pinocchio_model()
+    link = maniskill_private.objects_of(arm.link)[row].index
+    chain = _Chain(arm.models[env], link, arm.joints, arm.limits(env))
+    return chain, _pose(arm.articulation.pose.raw_pose[row])
 
 
 @dataclass(frozen=True)
@@ -242,26 +266,56 @@ class _Chain:
             starts.append(start)
         return starts
 
-    def solve(self, qpos: Floats, wanted: Pose, turns: bool) -> NDArray[np.float64] | None:
-        """Joint positions (J,) within the limits that give the pose or, if not `turns`, only its position;
-        None if the solver finds none from `qpos`."""
+    def solve(self, starts: Sequence[Floats], wanted: Pose) -> NDArray[np.float64] | None:
+        """Joint positions (J,) within the limits that give the pose or, without any, its position; None if none is
+        found from the joint positions `starts`."""
+        for find in (self._to_pose, self.to_position):
+            for q in starts:
+                if (found := find(q, wanted)) is not None:
+                    return found
+        return None
+
+    def _to_pose(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64] | None:
         mask = np.zeros(len(qpos), bool)
         mask[list(self.joints)] = True
         low, high = (np.where(mask, bound, qpos) for bound in self.limits.T)
-        goal, q = wanted, np.asarray(qpos, np.float64)
-        for _ in range(_RUNS if turns else _RUNS_FOR_POSITION):
+        q = np.asarray(qpos, np.float64)
+        for _ in range(_RUNS):
             result, _, _ = self.model.compute_inverse_kinematics(
-                self.link, goal, initial_qpos=q, active_qmask=mask, max_iterations=_ITERATIONS, dt=_STEP
+                self.link, wanted, initial_qpos=q, active_qmask=mask, max_iterations=_ITERATIONS, dt=_STEP
             )
             q = np.clip(np.asarray(result, np.float64), low, high)
-            now = self.pose(q)
-            left = _apart(now, wanted)
-            if _is_near(left) or (not turns and left[0] < NEAR_METRES / 2):
+            if _is_near(_apart(self.pose(q), wanted)):
                 return q
-            if not turns:
-                # The solver weighs metres like radians. With the present rotation in the goal, it reduces
-                # only the error of the position.
-                goal = _pose_of(wanted.p, now.q)
+        return None
+
+    def to_position(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64] | None:
+        """Joint positions (J,) within the limits that give the position, in any rotation; None if none is found from
+        `qpos`. By damped least squares of the position alone: SAPIEN's solver weighs metres like radians, and misses
+        positions that an arm reaches."""
+        own, q = list(self.joints), np.array(qpos, np.float64)
+        low, high = self.limits[own].T
+        errors: list[float] = []
+        for _ in range(_STEPS_TO_POSITION):
+            now = self.pose(q)
+            way = wanted.p - now.p
+            errors.append(float(np.linalg.norm(way)))
+            if errors[-1] < NEAR_METRES / 2:
+                return q
+            if (
+                min(errors[:-_STALLED_STEPS], default=np.inf)
+                < min(errors[-_STALLED_STEPS:]) + _STALLED_METRES
+            ):
+                return None
+            way *= min(1.0, _STEP_METRES / errors[-1])
+            turned = now.to_transformation_matrix()[:3, :3]
+            jacobian = turned @ self.model.compute_single_link_local_jacobian(q, self.link)[:3, own]
+            moved = _least_step(jacobian, way)
+            # The other joints make up for those that are held at a limit.
+            within = (q[own] + moved >= low) & (q[own] + moved <= high)
+            q[own] = np.clip(
+                q[own] + (moved if within.all() else _least_step(jacobian * within, way)), low, high
+            )
         return None
 
     def approach(self, qpos: Floats, wanted: Pose) -> NDArray[np.float64]:
@@ -271,13 +325,17 @@ class _Chain:
         for _ in range(_HALVINGS):
             middle = (reached + beyond) / 2
             goal = _pose_of(start + middle * (wanted.p - start), wanted.q)
-            solutions = (self.solve(found, goal, turns) for turns in (True, False))
-            between = next((one for one in solutions if one is not None), None)
+            between = self.solve([found], goal)
             if between is None:
                 beyond = middle
             else:
                 reached, found = middle, between
         return found
+
+
+def _least_step(jacobian: Floats, way: Floats) -> Floats:
+    """(J,) smallest change of the joints that moves the end effector along `way` (3,)."""
+    return jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _DAMPING**2 * np.eye(3), way)
 
 
 def _is_near(error: tuple[float, float]) -> bool:
