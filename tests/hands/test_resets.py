@@ -1,7 +1,7 @@
 """Where resets put the bodies."""
 
 # A session that has a task has a step.
-# pyright: reportOptionalMemberAccess=false
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 
@@ -15,9 +15,13 @@ from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
 from tests.drive.session import fake_worker_session, live_session, start_over, wait_until
-from workbench.hands.commands import HideResets, SampleResets
-from workbench.hands.panel import HandsPanel, spread_text
+from workbench.envs.inspection import Overlap
+from workbench.hands.commands import HideResets, SampleResets, ShowReset, ToggleGhosts
+from workbench.hands.panel import HandsPanel
+from workbench.hands.questions import FirstStates
 from workbench.hands.resets import MIN_EPISODES, ResetCloud, ResetSampled
+from workbench.hands.resets_panel import ResetsPanel
+from workbench.live.messages import Reset
 from workbench.page.command import Refused
 
 N = 64
@@ -30,14 +34,62 @@ def test_the_sampled_poses_are_those_of_the_episodes_with_these_seeds(
         session.do(SampleResets())
         view = wait_until(session, lambda v: v.of(ResetCloud).state == "done", "the resets")
         cloud = view.of(ResetCloud)
-        assert cloud.seeds == (0, N) and len(cloud.poses) * N >= MIN_EPISODES
+        assert cloud.seeds == (0, N) and len(cloud.states) * N >= MIN_EPISODES
         cube = view.task.geometry.body_names.index("cube")
         for batch, seed in enumerate(cloud.seeds):
             step = start_over(session, seed).step
             np.testing.assert_array_equal(cloud.of(cube)[batch], step.poses[:, cube])
         assert np.ptp(cloud.of(cube)[..., :2], axis=(0, 1)).min() > 0.1
+        assert cloud.overlaps("cube") == {} and not cloud.out_of_reach(cube).any()
+        assert cloud.out_of_reach(view.task.geometry.body_names.index("panda/panda_hand")) is None
         session.do(HideResets())
         assert session.view().of(ResetCloud).state == "none"
+
+
+PLACED = '''
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.building import actors
+from mani_skill.utils.building.ground import build_ground
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs.pose import Pose
+
+
+@register_env("Placed-v1", max_episode_steps=10)
+class PlacedEnv(BaseEnv):
+    """Two cubes: in env 1 inside each other, in env 2 five metres away."""
+
+    def __init__(self, *args, robot_uids="panda", **kwargs):
+        super().__init__(*args, robot_uids=robot_uids, **kwargs)
+
+    def _load_scene(self, options):
+        build_ground(self.scene)
+        self.one = actors.build_cube(self.scene, 0.02, [1, 0, 0, 1], "one")
+        self.other = actors.build_cube(self.scene, 0.02, [0, 1, 0, 1], "other")
+
+    def _initialize_episode(self, env_idx, options):
+        p = torch.tensor([[0.4, 0.0, 0.02], [0.4, 0.0, 0.02], [5.0, 0.0, 0.02]])[env_idx]
+        self.one.set_pose(Pose.create_from_pq(p=p))
+        self.other.set_pose(Pose.create_from_pq(p=torch.tensor([[0.4, 0.1, 0.02], [0.4, 0.03, 0.02], [0.4, 0.1, 0.02]])[env_idx]))
+
+    def evaluate(self):
+        return {"success": self.one.pose.p[:, 0] > 9}
+'''
+
+
+def test_overlaps_and_bodies_out_of_reach_are_found_in_their_envs(
+    child_process: None, tmp_path: Path
+) -> None:
+    (task := tmp_path / "placed.py").write_text(PLACED)
+    with live_session(task, tmp_path / "recordings", num_envs=3) as session:
+        session.do(SampleResets())
+        view = wait_until(session, lambda v: v.of(ResetCloud).states, "a reset")
+        cloud, names = view.of(ResetCloud), view.task.geometry.body_names
+        (depths,) = cloud.overlaps("one").values()
+        np.testing.assert_allclose(depths[0], [0, 0.01, 0], atol=1e-3)
+        assert list(cloud.overlaps("other")) == ["one"] and list(cloud.overlaps("one")) == ["other"]
+        assert cloud.out_of_reach(names.index("one"))[0].tolist() == [False, False, True]
+        assert not cloud.out_of_reach(names.index("other"))[0].any()
 
 
 def test_a_new_version_is_sampled_again_and_late_results_are_dropped(
@@ -50,36 +102,91 @@ def test_a_new_version_is_sampled_again_and_late_results_are_dropped(
         begun: list[object] = []
         monkeypatch.setattr(fake.session._resets, "perform", begun.append)
         fake.session.do(SampleResets())
-        poses = fake.view.step.poses
-        fake.session.happen(ResetSampled(0, poses))
+        states = FirstStates(fake.view.step.poses)
+        fake.session.happen(ResetSampled(0, states))
         assert fake.view.of(ResetCloud).seeds == (0,)
         fake.load("patched")
         assert fake.view.of(ResetCloud).seeds == () and len(begun) == 2
         fake.session.do(HideResets())
-        fake.session.happen(ResetSampled(0, poses))
+        fake.session.happen(ResetSampled(0, states))
         assert fake.view.of(ResetCloud) == replace(ResetCloud(), serial=fake.view.of(ResetCloud).serial)
 
 
-def test_the_points_are_drawn_at_the_selected_body_and_a_click_names_seed_and_env(panels: Panels) -> None:
-    session, offset = StubSession(), np.array([5.0, 0.0, 0.0])
-    panel = HandsPanel(panels.server, session, lambda: "cube")  # type: ignore[arg-type]
+def test_a_sampled_reset_is_shown_in_its_env_with_its_seed(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.load()
+        fake.asked(Reset)
+        with pytest.raises(Refused):
+            fake.session.do(ShowReset(seed=6, env=3))
+        assert not fake.asked(Reset)
+        fake.session.do(ShowReset(seed=6, env=2))
+        assert fake.view.selected_env == 2 and fake.view.seed == 6
+        assert fake.asked(Reset) == [Reset(None, 6)]
+
+
+@pytest.fixture
+def sampled(panels: Panels) -> tuple[ResetsPanel, StubSession, ResetCloud]:
+    """Two resets of three envs, drawn at the selected cube: in env 0 it overlaps, in env 1 it is out of reach, and in
+    env 2 it is missing after the second reset."""
+    session = StubSession()
+    hands = HandsPanel(panels.server, session, lambda: "cube")  # type: ignore[arg-type]
+    panel = ResetsPanel(panels.server, session, lambda: hands.selected)  # type: ignore[arg-type]
     view = running(3, selected_env=1)
     cube = view.task.geometry.body_names.index("cube")
     batches = [view.step.poses.copy() for _ in range(2)]
     for k, poses in enumerate(batches):
         poses[:, cube, :3] = [[0.1 * env, 0.1 * k, 0.02] for env in range(3)]
     batches[1][2, cube] = np.nan
-    cloud = ResetCloud("done", 1, (7, 10), tuple(batches), 2)
+    overlaps = (Overlap(("cube", "table"), 0.012),), (), ()
+    beyond = np.array([[False], [True], [False]])
+    states = tuple(FirstStates(poses, overlaps, (cube,), beyond) for poses in batches)
+    cloud = ResetCloud("done", 1, (7, 10), states, 2)
     session.shown = view = replace(view, features={ResetCloud: cloud})
-    panel.draw_in_view(view, view.step.poses, offset)
+    hands.draw_in_view(view, view.step.poses, np.array([5.0, 0.0, 0.0]))
+    panel.draw(view)
+    panel.draw_in_view(view)
+    return panel, session, cloud
+
+
+def test_the_points_are_drawn_at_the_selected_body_and_a_click_names_seed_and_env(
+    panels: Panels, sampled: tuple[ResetsPanel, StubSession, ResetCloud]
+) -> None:
+    panel, session, _ = sampled
+    offset = np.array([5.0, 0.0, 0.0])
     (points,) = panels.nodes("/hands/resets")
     assert len(points.points) == 5 and points.points[:, 0].min() == 5.0
+    colours = points.colors.tolist()
+    assert colours[0] == colours[3] and colours[1] == colours[4]
+    assert len({tuple(colour) for colour in colours}) == 3
     eye = np.array([5.0, 0.0, 3.0])
-    assert panel.reset_under_ray(eye, np.array([0.1, 0.1, 0.02]) + offset - eye) == (10, 1)
+    at_point = np.array([0.1, 0.1, 0.02]) + offset - eye
+    assert panel.reset_under_ray(eye, at_point) == ShowReset(seed=10, env=1)
     assert panel.reset_under_ray(eye, np.array([0.15, 0.15, 0.02]) + offset - eye) is None
-    assert panel.reset_under_ray(eye, eye - offset - np.array([0.1, 0.1, 0.02])) is None
-    text = spread_text(cloud, cube)
-    assert "5 resets" in text and "x 0.000 to 0.200 m" in text
-    session.shown = view = replace(view, features={})
-    panel.draw_in_view(view, view.step.poses, offset)
+    assert panel.reset_under_ray(eye, -at_point) is None
+    session.shown = view = replace(session.shown, features={})
+    panel.draw_in_view(view)
     assert not panels.nodes("/hands/resets")
+
+
+def test_the_panel_counts_the_resets_and_offers_those_that_overlap_or_are_out_of_reach(
+    panels: Panels, sampled: tuple[ResetsPanel, StubSession, ResetCloud]
+) -> None:
+    html = panels.html("wb-resets")
+    assert html.count("<svg") == 2, "x and y vary"
+    assert "2 of 5" in html and "12 mm" in html and "table" in html
+    for command in (ShowReset(seed=7, env=0), ShowReset(seed=10, env=0), ShowReset(seed=7, env=1)):
+        assert f"seed {command.seed} env {command.env}" in html
+    assert "seed 7 env 2" not in html
+
+
+def test_the_shapes_are_as_many_as_the_resets_that_have_the_body(
+    panels: Panels, sampled: tuple[ResetsPanel, StubSession, ResetCloud]
+) -> None:
+    panel, session, _ = sampled
+    panel.do(ToggleGhosts(), None)  # type: ignore[arg-type]
+    panel.draw_in_view(session.shown)
+    (shape,) = panels.nodes("/hands/ghosts/0")
+    np.testing.assert_allclose(np.sort(shape.batched_positions[:, 0]), [5, 5, 5.1, 5.1, 5.2], atol=1e-6)
+    panel.do(ToggleGhosts(), None)  # type: ignore[arg-type]
+    panel.draw_in_view(session.shown)
+    assert not panels.nodes("/hands/ghosts/0")

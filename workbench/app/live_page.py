@@ -33,8 +33,9 @@ from workbench.hands.joints_panel import JointsPanel, with_dragged_joint
 from workbench.hands.look import BodyView
 from workbench.hands.panel import HandsPanel
 from workbench.hands.reach_panel import ReachPanel
+from workbench.hands.resets_panel import ResetsPanel
 from workbench.hands.state import Hands
-from workbench.live.commands import ChoosePictures, SetSeed
+from workbench.live.commands import ChoosePictures
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
 from workbench.live.panels.banners import Banner, BusyBanner
@@ -276,6 +277,7 @@ class Page:
             self._body_view = BodyView(
                 server, lambda: self._inspect.body, lambda: self._hands.selected, below - 0.25
             )
+            self._resets = ResetsPanel(server, session, lambda: self._hands.selected, below + 0.25)
         with tabs.add_tab(TRY, viser.Icon.FLASK):
             self._solve = SolvePanel(server, session, self._open_tabs, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
@@ -283,7 +285,17 @@ class Page:
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
         of_run = self._run, drive, self._reach, version, options, self._view_panel
-        return [*of_run, self._inspect, self._hands, self._body_view, self._solve, seeds, profile, checks]
+        return [
+            *of_run,
+            self._inspect,
+            self._hands,
+            self._body_view,
+            self._resets,
+            self._solve,
+            seeds,
+            profile,
+            checks,
+        ]
 
     def _add_left_dock(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
@@ -499,6 +511,7 @@ class Page:
         hovered = self._inspect.hovered if self._inspect.hovered != self._inspect.body else ""
         self._hover_mark.draw(task.geometry, poses, env, hovered, offset)
         self._hands.draw_in_view(view, poses, offset)
+        self._resets.draw_in_view(view)
         read = self._inspect.body_reading(view) if self._view_choice.frames else None
         self._body_view.draw_in_view(view, poses, offset, read)
         self._reach.draw_in_view(view, poses, offset)
@@ -549,10 +562,8 @@ class Page:
         if (camera := self._frustums.under_ray(*ray)) is not None:
             self._session.happen(CameraChosen(camera))
             return
-        if (reset := self._hands.reset_under_ray(*ray)) is not None:
-            seed, env = reset
-            self._session.change(selected_env=env)
-            self._session.do(SetSeed(seed=seed))
+        if (reset := self._resets.reset_under_ray(*ray)) is not None:
+            self._session.do(reset)
             return
         alone = self._icons.only_selected or view.task.num_envs == 1
         env = view.selected_env if alone else env_under_ray(layout, *ray)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from workbench.live.commands import MAX_SEED
 from workbench.page.command import Command
 
 Axis = Literal["x", "y", "z"]
@@ -69,6 +70,19 @@ class SampleResets(Command, frozen=True):
 
 class HideResets(Command, frozen=True):
     """Hide where resets put the selected body."""
+
+    context = "live"
+
+
+class ShowReset(Command, frozen=True):
+    """Select an env, and reset all envs with this seed."""
+
+    seed: Annotated[int, msgspec.Meta(ge=0, le=MAX_SEED)]
+    env: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class ToggleGhosts(Command, frozen=True):
+    """Draw the selected body's shape where resets put it, or only points."""
 
     context = "live"
 

@@ -17,8 +17,6 @@ from workbench.hands.commands import (
     Angle,
     Axis,
     ChooseMovedEnvs,
-    HideResets,
-    SampleResets,
     SetBodyAngle,
     SetBodyPosition,
     ToggleHandles,
@@ -26,7 +24,6 @@ from workbench.hands.commands import (
 )
 from workbench.hands.pose_edit import PoseEdit, PoseWanted
 from workbench.hands.pose_panel import pose_edit_html
-from workbench.hands.resets import ResetCloud
 from workbench.hands.state import (
     BodyMoved,
     BodyPulled,
@@ -56,8 +53,6 @@ Phase = Literal["start", "update", "end"]
 XYZ, ANGLES = get_args(Axis), get_args(Angle)
 TITLE = "Move"
 GIZMO_PIXELS = 76.0
-POINT_METRES = 0.006
-POINT_COLOUR = (255, 146, 43)
 MIN_GRIP_METRES = 0.01
 """Minimum side of the box that is dragged, so that a thin body can be hit."""
 HINT = (
@@ -137,19 +132,6 @@ class HandsPanel(PagePart[SessionView]):
             self._scope = scope_choice(server)
             self._tools = server.gui.add_html("")
             self._change = server.gui.add_html("", visible=False)
-            self._spread = server.gui.add_html("", visible=False)
-        self._points = InView(
-            partial(
-                server.scene.add_point_cloud,
-                "/hands/resets",
-                colors=POINT_COLOUR,
-                point_size=POINT_METRES,
-                point_shape="circle",
-                precision="float32",
-            ),
-            "points",
-        )
-        self._drawn_points: tuple[int, int, bytes] | None = None
         self._grip = InView(self._add_grip, "dimensions", "position", "wxyz")
         self._gizmo = server.scene.add_transform_controls(
             "/hands/gizmo", GIZMO_PIXELS, fixed=True, depth_test=False, visible=False
@@ -175,7 +157,6 @@ class HandsPanel(PagePart[SessionView]):
             self._handles_on,
             view.of(Hands).all_envs,
             view.playing,
-            view.of(ResetCloud).serial,
             view.of(PoseEdit),
         )
 
@@ -198,17 +179,12 @@ class HandsPanel(PagePart[SessionView]):
         handles = Tool(
             "Handles", ToggleHandles(), with_key(ToggleHandles), on=self._handles_on, off=bool(why)
         )
-        cloud = view.of(ResetCloud)
-        shows = cloud.state != "none"
-        sampled: Command = HideResets() if shows else SampleResets()
-        resets = Tool("Where resets put it", sampled, type(sampled).help(), on=shows)
         write = Tool(
             "Write into the file", WriteBodyPose(), WriteBodyPose.help(), off=bool(why) or view.playing
         )
-        self._tools.content = tools_html([handles, resets], [write])
+        self._tools.content = tools_html([handles, write])
         edit = view.of(PoseEdit)
         self._change.content, self._change.visible = pose_edit_html(edit), edit.stage != "none"
-        self._spread.content, self._spread.visible = render("note", text=spread_text(cloud, known.row)), shows
         name_fold(self._fold, TITLE, known.body)
 
     def do(self, command: Command, visitor: Visitor) -> None:
@@ -290,41 +266,6 @@ class HandsPanel(PagePart[SessionView]):
             self._gizmo.position = tuple((known.pose[:3] + offset).tolist())
             self._gizmo.wxyz = tuple(known.pose[3:].tolist())
         self._draw_force(view)
-        self._draw_resets(view.of(ResetCloud), known)
-
-    def reset_under_ray(self, origin: Floats, direction: Floats) -> tuple[int, int] | None:
-        """Seed and env of the sampled reset whose point a click hits; None if the click hits no point.
-
-        Args:
-            origin, direction: (3,) of the click's ray in the view.
-        """
-        cloud, known = self._session.view().of(ResetCloud), self.selected
-        if known is None or self._points.handle is None:
-            return None
-        points = cloud.of(known.row)[..., :3] + known.offset
-        towards = points - origin
-        direction = direction / np.linalg.norm(direction)
-        along = towards @ direction
-        apart = np.linalg.norm(towards - along[..., None] * direction, axis=-1)
-        near = np.where((along > 0) & np.isfinite(apart), apart, np.inf)
-        batch, env = np.unravel_index(int(near.argmin()), near.shape)
-        if near[batch, env] > 2 * POINT_METRES:
-            return None
-        return cloud.seeds[int(batch)], int(env)
-
-    def _draw_resets(self, cloud: ResetCloud, known: Selected | None) -> None:
-        if known is None or not cloud.poses:
-            self._points.draw()
-            self._drawn_points = None
-            return
-        wanted = (cloud.serial, known.row, np.asarray(known.offset).tobytes())
-        if wanted == self._drawn_points:
-            return
-        self._drawn_points = wanted
-        points = (cloud.of(known.row)[..., :3] + known.offset).reshape(-1, 3).astype(np.float32)
-        # viser's points and colours must have equal lengths, and are set one after the other.
-        self._points.draw()
-        self._points.draw(points[np.isfinite(points).all(axis=1)])
 
     def _find(self, view: SessionView, poses: NDArray[np.float32]) -> Selected | None:
         task, body, env = view.task, self._body(), view.selected_env
@@ -464,22 +405,6 @@ def _can_be_dragged(known: Selected, view: SessionView) -> bool:
         return not why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu")
     # Not kinematic: after a stray click on a table, the next drag must not move the table.
     return known.kind == "dynamic"
-
-
-def spread_text(cloud: ResetCloud, body: int) -> str:
-    """Ranges of a body's positions and of its rotation about z over the sampled resets."""
-    if cloud.state == "failed":
-        return f"The resets failed: {cloud.why}"
-    poses = cloud.of(body).reshape(-1, 7).astype(np.float64)
-    poses = poses[np.isfinite(poses).all(axis=1)]
-    if not len(poses):
-        return "Resetting in the background ..."
-    low, high = poses[:, :3].min(axis=0), poses[:, :3].max(axis=0)
-    ranges = [f"{axis} {a:.3f} to {b:.3f} m" for axis, a, b in zip("xyz", low, high, strict=True)]
-    yaw = [rpy_of(pose[3:])[2] for pose in poses]
-    ranges.append(f"yaw {min(yaw):.0f}° to {max(yaw):.0f}°")
-    more = "" if cloud.state == "done" else f", {len(cloud.seeds)} of {cloud.total} batches"
-    return f"{len(poses)} resets{more}: {'; '.join(ranges)}. Click a point to show that reset."
 
 
 def _steps(view: SessionView, env: int) -> int:

@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.checks.state import load_version
-from workbench.hands.commands import HideResets, SampleResets
-from workbench.live.effects import Asked
+from workbench.hands.commands import HideResets, SampleResets, ShowReset
+from workbench.hands.questions import FirstStates, SampleReset
+from workbench.live.commands import SetSeed
+from workbench.live.effects import Asked, Then
+from workbench.live.env_commands import SelectEnv
 from workbench.live.events import VersionLoaded
-from workbench.live.messages import Load, Reset
+from workbench.live.messages import Load
 from workbench.live.process.ask import Background
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
 from workbench.live.run import Run
@@ -22,7 +25,7 @@ from workbench.machine.loop import do
 from workbench.page.command import Command, Refused
 from workbench.task.problem import Problem
 
-DOES: frozenset[type[Command]] = frozenset({SampleResets, HideResets})
+DOES: frozenset[type[Command]] = frozenset({SampleResets, HideResets, ShowReset})
 """Commands that `apply` handles."""
 MIN_EPISODES = 128
 """Minimum number of sampled episodes, over all envs."""
@@ -32,15 +35,15 @@ MAX_BATCHES = 64
 
 @dataclass(frozen=True)
 class ResetCloud:
-    """First poses of the bodies after resets with different seeds. Also the view of this feature."""
+    """First states after resets with different seeds. Also the view of this feature."""
 
     state: Literal["none", "running", "done", "failed"] = "none"
     serial: int = 0
     """Grows with every change."""
     seeds: tuple[int, ...] = ()
     """Seed of each reset of the whole batch so far."""
-    poses: tuple[NDArray[np.float32], ...] = ()
-    """(N, B, 7) after each of these resets, as in `StepResult.poses`."""
+    states: tuple[FirstStates, ...] = ()
+    """The states after each of these resets."""
     total: int = 0
     """Number of resets when the job is done."""
     why: str = ""
@@ -50,9 +53,35 @@ class ResetCloud:
 
     def of(self, body: int) -> NDArray[np.float32]:
         """(S, N, 7) poses of one body; NaN in envs that lack the body."""
-        if not self.poses:
+        if not self.states:
             return np.zeros((0, 0, 7), np.float32)
-        return np.stack([poses[:, body] for poses in self.poses])
+        return np.stack([states.poses[:, body] for states in self.states])
+
+    def knows_overlaps(self) -> bool:
+        return all(states.overlaps is not None for states in self.states)
+
+    def overlaps(self, body: str) -> dict[str, NDArray[np.float64]]:
+        """Depths (S, N) in metres to which each other body is inside this one, by name, the most frequent one first; 0
+        where they do not overlap."""
+        found: dict[str, NDArray[np.float64]] = {}
+        for batch, states in enumerate(self.states):
+            for env, overlaps in enumerate(states.overlaps or ()):
+                for overlap in overlaps:
+                    if body in overlap.bodies:
+                        first, second = overlap.bodies
+                        shape = len(self.states), len(states.poses)
+                        other = second if body == first else first
+                        found.setdefault(other, np.zeros(shape))[batch, env] = overlap.depth
+        return dict(sorted(found.items(), key=lambda item: -np.count_nonzero(item[1])))
+
+    def out_of_reach(self, body: int) -> NDArray[np.bool_] | None:
+        """(S, N) whether no arm reaches the body; None if that is not known of this body."""
+        rows = [
+            states.out_of_reach[:, states.reach_of.index(body)]
+            for states in self.states
+            if states.out_of_reach is not None and body in states.reach_of
+        ]
+        return np.stack(rows) if rows else None
 
 
 @dataclass(frozen=True)
@@ -60,8 +89,7 @@ class ResetSampled:
     """A reset of the whole batch."""
 
     seed: int
-    poses: NDArray[np.float32]
-    """(N, B, 7)"""
+    states: FirstStates
 
 
 @dataclass(frozen=True)
@@ -86,7 +114,7 @@ class EndSampling:
 
 
 ResetsEvent = ResetSampled | SamplingFailed
-ResetsEffect = BeginSampling | EndSampling
+ResetsEffect = BeginSampling | EndSampling | Then
 Change = tuple[ResetCloud, list[ResetsEffect]]
 
 
@@ -101,16 +129,25 @@ def apply(cloud: ResetCloud, event: object, run: Run) -> Change:
             return _begin(cloud, run)
         case Asked(command=HideResets()):
             return ResetCloud(serial=cloud.serial + 1), [EndSampling()]
+        case Asked(command=ShowReset(seed=seed, env=env)):
+            return cloud, [*show_reset(run, seed, env)]
         case VersionLoaded() if cloud.state != "none":
             return _begin(cloud, run)
-        case ResetSampled(seed=seed, poses=poses) if cloud.state == "running":
+        case ResetSampled(seed=seed, states=states) if cloud.state == "running":
             seeds = (*cloud.seeds, seed)
-            state = "done" if len(seeds) == cloud.total else "running"
-            sampled = replace(cloud, state=state, seeds=seeds, poses=(*cloud.poses, poses))
+            stage = "done" if len(seeds) == cloud.total else "running"
+            sampled = replace(cloud, state=stage, seeds=seeds, states=(*cloud.states, states))
             return replace(sampled, serial=cloud.serial + 1), []
         case SamplingFailed(why=why, problem=problem) if cloud.state == "running":
             return replace(cloud, state="failed", serial=cloud.serial + 1, why=why, problem=problem), []
     return cloud, []
+
+
+def show_reset(run: Run, seed: int, env: int) -> list[Then]:
+    """Effects that select an env and reset all envs with this seed. Raises `Refused` if there is no such env."""
+    if env >= run.num_envs:
+        raise Refused(f"There is no env {env}: the envs are 0 to {run.num_envs - 1}.")
+    return [Then(Asked(SelectEnv(env=env))), Then(Asked(SetSeed(seed=seed)))]
 
 
 def _begin(cloud: ResetCloud, run: Run) -> Change:
@@ -150,9 +187,9 @@ class ResetJobs:
     async def _sample(self, job: Job, load: Load, seeds: tuple[int, ...]) -> None:
         for seed in seeds:
 
-            async def ask(seed: int = seed) -> NDArray[np.float32]:
+            async def ask(seed: int = seed) -> FirstStates:
                 await load_version(self._process, job, load)
-                return (await self._process.ask(Reset(None, seed))).poses
+                return await self._process.ask(SampleReset(seed))
 
             self._happen(ResetSampled(seed, await self._process.in_turns(job, ask)))
 

@@ -26,7 +26,9 @@ from workbench.envs.maniskill_private import mark_camera_configs
 from workbench.envs.step_result import StepResult
 from workbench.envs.task_drawings import drawings
 from workbench.envs.task_env import TaskEnv
+from workbench.hands.questions import SampleReset
 from workbench.hands.reach_worker import LedArms, set_arm
+from workbench.hands.reset_worker import first_states
 from workbench.hands.worker import Hand, move_body, move_joints
 from workbench.live.messages import (
     SCENE_KEPT,
@@ -251,6 +253,10 @@ class Worker:
             return self._cameras.place_now(opened, question)
         if isinstance(question, Reset):
             return self._reset_envs(opened, question.env_idx, self._seeds(question))
+        if isinstance(question, SampleReset):
+            poses = self._reset_envs(opened, None, question.seed).poses
+            with blamed("step", opened.loaded, opened.env):
+                return first_states(opened.env, poses)
         if isinstance(question, RescoreMoments):
             return rescore_moments(opened, question)
         if isinstance(question, CaptureMoment):
