@@ -33,6 +33,7 @@ from workbench.hands.joints_panel import JointsPanel, with_dragged_joint
 from workbench.hands.look import BodyView
 from workbench.hands.panel import HandsPanel
 from workbench.hands.reach_panel import ReachPanel
+from workbench.hands.reset_until_panel import ResetUntilPanel
 from workbench.hands.resets_panel import ResetsPanel
 from workbench.hands.state import Hands
 from workbench.live.commands import ChoosePictures
@@ -246,6 +247,8 @@ class Page:
             with self._run.actions:
                 drive = DrivePanel(server, session, self._run.below_mode)
                 self._reach = ReachPanel(server, session, self._run.below_mode + 0.1)
+            with self._run.episode:
+                until = ResetUntilPanel(server, self._run.below_pause)
             self._joints = JointsPanel(server, self._run.actions.order + 0.5)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
@@ -284,7 +287,7 @@ class Page:
             profile = StepProfilePanel(server, self._link)
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
-        of_run = self._run, drive, self._reach, version, options, self._view_panel
+        of_run = self._run, until, drive, self._reach, version, options, self._view_panel
         return [
             *of_run,
             self._inspect,

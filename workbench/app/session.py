@@ -23,6 +23,7 @@ from workbench.checks.state import BeginCheck, CheckJobs, Checks, ChecksView, En
 from workbench.envs.recorded_run import RecordedRun
 from workbench.hands.pose_edit import ChangePoseFile, CheckPose, PlanPose
 from workbench.hands.pose_jobs import PoseJobs
+from workbench.hands.reset_until import BeginSearch, EndSearch, SearchJobs
 from workbench.hands.resets import BeginSampling, EndSampling, ResetJobs
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import (
@@ -165,6 +166,7 @@ class Session:
         self._seeds = SeedsJobs(recordings, self._happen)
         self._policies = PolicySearch(self._happen)
         self._resets = ResetJobs(self._background, self._happen)
+        self._searches = SearchJobs(self._background, self._happen)
         self._poses = PoseJobs(self._background, self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
@@ -246,6 +248,8 @@ class Session:
                 self._profiles.perform(effect)
             case BeginSampling() | EndSampling():
                 self._resets.perform(effect)
+            case BeginSearch() | EndSearch():
+                self._searches.perform(effect)
             case PlanPose() | ChangePoseFile() | CheckPose():
                 self._poses.perform(effect)
             case BeginPlan() | EndPlan():
@@ -296,6 +300,7 @@ class Session:
             studio_view_of(state.studio, run, self._studio.progress),
             state.hands,
             state.resets,
+            state.search,
             state.pose_edit,
         )
         return view_of(
@@ -389,6 +394,7 @@ class Session:
         self._checks.close()
         self._profiles.close()
         self._resets.close()
+        self._searches.close()
         self._poses.close()
         self._plans.close()
         self._seeds.close()

@@ -10,6 +10,7 @@ from workbench.cameras.state import Studio
 from workbench.checks import profile as of_profile
 from workbench.checks import state as of_checks
 from workbench.hands import pose_edit as of_pose
+from workbench.hands import reset_until as of_search
 from workbench.hands import resets as of_resets
 from workbench.hands import state as of_hands
 from workbench.live import apply as of_run
@@ -39,6 +40,7 @@ SessionEvent = (
     | StudioEvent
     | of_hands.HandEvent
     | of_resets.ResetsEvent
+    | of_search.SearchEvent
     | of_pose.PoseEvent
 )
 Effect = (
@@ -53,6 +55,7 @@ Effect = (
     | of_policies.ListPolicies
     | StudioEffect
     | of_resets.ResetsEffect
+    | of_search.SearchEffect
     | of_pose.PoseEffect
     | Then
 )
@@ -67,6 +70,7 @@ DOES: frozenset[type[Command]] = (
     | of_studio.DOES
     | of_hands.DOES
     | of_resets.DOES
+    | of_search.DOES
     | of_pose.DOES
 )
 """Commands that `apply` handles."""
@@ -96,6 +100,8 @@ class State:
     """A person who drives the robot."""
     resets: of_resets.ResetCloud = of_resets.ResetCloud()
     """Where resets put the bodies."""
+    search: of_search.ResetSearch = of_search.ResetSearch()
+    """The search for a first state that meets a condition."""
     pose_edit: of_pose.PoseEdit = of_pose.PoseEdit()
     """The change of the file that gives a body another first pose."""
 
@@ -118,9 +124,22 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
     hands, for_hands = of_hands.apply(state.hands, event, run, recording.env_idx)
     resets, for_resets = of_resets.apply(state.resets, event, run)
+    search, for_search = of_search.apply(state.search, event, run)
     pose, for_pose = of_pose.apply(state.pose_edit, event, run)
     new = State(
-        run, recording, studio, rescoring, checks, profile, seeds, solving, policies, hands, resets, pose
+        run,
+        recording,
+        studio,
+        rescoring,
+        checks,
+        profile,
+        seeds,
+        solving,
+        policies,
+        hands,
+        resets,
+        search,
+        pose,
     )
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
@@ -134,6 +153,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         *for_seeds,
         *for_solver,
         *for_resets,
+        *for_search,
         *for_pose,
     ]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio, *for_hands]

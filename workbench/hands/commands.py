@@ -74,6 +74,18 @@ class HideResets(Command, frozen=True):
     context = "live"
 
 
+class ResetUntil(Command, frozen=True):
+    """Reset with successive seeds until the first state of an env meets the condition of Pause when."""
+
+    context = "live"
+
+
+class StopResetUntil(Command, frozen=True):
+    """Stop resetting until a condition is met."""
+
+    context = "live"
+
+
 class ShowReset(Command, frozen=True):
     """Select an env, and reset all envs with this seed."""
 

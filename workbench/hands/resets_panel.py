@@ -35,9 +35,10 @@ COLOURS = ("#ff922b", "#e03131", "#be4bdb")
 BINS = 24
 SAME = 1e-3
 """Range, in metres or degrees, of values that count as equal."""
-MAX_SEEDS = 4
+MAX_SEEDS = 3
 """Maximum number of resets that a row names."""
-MAX_ROWS = 6
+MAX_ROWS = 3
+"""Maximum number of bodies that are named as overlapping."""
 MAX_GHOSTS, MAX_GHOST_FACES = 128, 60_000
 """Maximum number of shapes in the view, and of their triangles."""
 MIN_FACES = 60
@@ -276,12 +277,12 @@ def trouble_rows(cloud: ResetCloud, row: int, body: str) -> list[ResetsRow]:
     """A row for each body that overlaps this one, and one for the resets that put the body out of reach."""
     count = int(np.isfinite(cloud.of(row)).all(axis=-1).sum())
     rows = [
-        _row(cloud, OVERLAPS, f"{1000 * depths.max():.0f} mm inside {other}", depths > 0, count)
+        _row(cloud, OVERLAPS, f"up to {1000 * depths.max():.0f} mm inside {other},", depths > 0, count)
         for other, depths in list(cloud.overlaps(body).items())[:MAX_ROWS]
     ]
     beyond = cloud.out_of_reach(row)
     if beyond is not None and beyond.any():
-        rows.append(_row(cloud, BEYOND, "out of the robot's reach", beyond, count))
+        rows.append(_row(cloud, BEYOND, "out of the robot's reach,", beyond, count))
     return rows
 
 
@@ -303,14 +304,21 @@ def notes(cloud: ResetCloud, row: int, body: str) -> list[str]:
     if not cloud.states:
         return []
     found = []
+    others = len(cloud.overlaps(body))
     if not cloud.knows_overlaps():
         found.append("Overlaps are not known in GPU simulation.")
-    elif not cloud.overlaps(body):
+    elif others > MAX_ROWS:
+        found.append(f"It is inside {others - MAX_ROWS} more bodies.")
+    elif not others:
         found.append("It is never more than 2 mm inside another body.")
     beyond = cloud.out_of_reach(row)
     if beyond is None:
-        found.append("Reach was not checked: no arm, or a body of the robot or of the building.")
+        found.append(
+            "Reach is checked only for bodies that move and are no part of the robot, if there is an arm."
+        )
     else:
-        said = "An end effector reaches its origin" if not beyond.any() else "Reach means its origin"
-        found.append(f"{said}, in any rotation of the tool; collisions of the arm are not considered.")
+        found.append(
+            "Within reach: the joint limits let an end effector be at the body's origin, in any rotation. Collisions of "
+            "the arm are not considered."
+        )
     return found

@@ -176,7 +176,7 @@ class RunPanel(PagePart[SessionView]):
             self._policy.visible = self._known.visible = self._policy_hint.visible = False
             self._sliders = ActionSliders(server, session)
 
-        with gui.add_folder("Episode"):
+        with gui.add_folder("Episode") as self.episode:
             self._seed = Field(server, "Seed", SetSeed, "seed", "0", hint="A new seed resets every env.")
             self._end = choice(server, "At the end", ChooseEpisodeEnd, "rule", EPISODE_ENDS, "reset")
             self._pause = choice(
@@ -185,6 +185,8 @@ class RunPanel(PagePart[SessionView]):
             tests = get_args(Test)
             self._pause_test = choice(server, "It", ChoosePauseTest, "test", tests, tests[0])
             self._pause_level = Field(server, "Level", SetPauseLevel, "level", 0.0, step=0.1)
+            self.below_pause = self._pause_level.order + 0.5
+            """viser's order of what comes after the condition to pause, in `episode`."""
             self._resets = gui.add_html("")
 
     def do(self, command: Command, visitor: Visitor) -> None:
