@@ -27,6 +27,7 @@ from workbench.envs.keywords import HowMade, Keyword
 from workbench.envs.robots import Joint, JointTarget, RobotDescription, RobotKeyframe, RobotLink
 from workbench.hands.joints_panel import TITLE as JOINTS
 from workbench.hands.reach import Reach
+from workbench.hands.reset_until import ResetSearch
 from workbench.hands.state import DraggedJoint, Hands
 from workbench.live.history.curves import Column
 from workbench.live.history.moments import RESET, SUCCESS, EpisodeNumbers
@@ -207,6 +208,7 @@ CHANGES: dict[str, Any] = {
         hands=Hands(driving=True, note="kept"), recording=RecordingStatus(kept=KeptEpisodes(1, 1))
     ),
     "a condition to pause at": just(pause_when=PauseWhen("reward", "rises above", 0.5)),
+    "a search for a first state": just(search=ResetSearch("running", PauseWhen("success"), 8, 40, 4)),
     "a pause at a condition": just(pause_when=PauseWhen("success"), paused_at=30),
     "a picture": just(pictures=picture(200), pictures_serial=2),
     "a camera that fails": just(failed_cameras={KEY: "It cannot be drawn."}),
