@@ -64,7 +64,7 @@ VIEWS: dict[str, View] = {
     "two_robots": View("Reward", 4, 24, "solvers.py:lift_bar", HAND, ONE, (-220, 0), 2),
     "locomotion": View("Reward", 9, 40),
     "cameras": View("Cameras", 4, 4, keys=ONE, turned=(-220, 0), nearer=1, all_cameras=True),
-    "custom_scene": View("Inspect", 4, 12, keys=ONE, turned=(-250, 0), nearer=3, show="poses"),
+    "custom_scene": View("Inspect", 4, 12, keys=ONE, turned=(-250, 0), nearer=3, show="bodies"),
     "different_objects": View("Reward", 9, nearer=1),
     "fail_conditions": View("Reward", 9, 40, nearer=1),
     "obs_history": View("Inspect", 4, 20, keys=ONE, turned=(-250, 0), nearer=2, show="observation"),

@@ -108,7 +108,7 @@ def show(page: Page, what: str) -> None:
 
 def test_a_pose_is_copied(page: Page) -> None:
     open_tab(page, "Inspect")
-    show(page, "poses")
+    show(page, "bodies")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     expect(page.locator(".wb-leaves").get_by_text("cube", exact=True)).to_be_visible()
     page.locator(".wb-leaves tr", has=page.get_by_text("cube", exact=True)).locator(".wb-pill").click()

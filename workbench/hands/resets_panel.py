@@ -30,7 +30,7 @@ Floats = NDArray[np.floating[Any]]
 TITLE = "Where resets put it"
 POINT_METRES = 0.006
 FINE, OVERLAPS, BEYOND = 0, 1, 2
-COLOURS = ("#ff922b", "#e03131", "#be4bdb")
+COLOURS = ("#15aabf", "#e03131", "#be4bdb")
 """Colours of resets that are fine, in which the body overlaps another, and in which no arm reaches the body."""
 BINS = 24
 SAME = 1e-3
@@ -191,7 +191,7 @@ class ResetsPanel(PagePart[SessionView]):
                     batched_wxyzs=poses[shown][:, 3:],
                     batched_positions=(poses[shown][:, :3] + known.offset).astype(np.float32),
                     batched_colors=colours[shown],
-                    opacity=0.25,
+                    opacity=0.35,
                     lod="off",
                     flat_shading=True,
                     cast_shadow=False,
