@@ -91,7 +91,7 @@ def test_a_search_is_bounded_stops_and_goes_on_where_it_stopped(tmp_path: Path, 
         assert isinstance(search, BeginSearch) and search.seeds[:2] == range(3, 9, 3)
         fake.session.happen(ResetTried(3, 3, ()))
         fake.session.do(StopResetUntil())
-        assert isinstance(begun[-1], EndSearch)
+        assert EndSearch() in begun
         fake.session.happen(ResetTried(6, 3, (0,)))
         assert fake.view.of(ResetSearch).state == "stopped" and fake.view.seed == 0
         fake.session.do(ResetUntil())

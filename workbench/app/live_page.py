@@ -248,7 +248,7 @@ class Page:
                 drive = DrivePanel(server, session, self._run.below_mode)
                 self._reach = ReachPanel(server, session, self._run.below_mode + 0.1)
             with self._run.episode:
-                until = ResetUntilPanel(server, self._run.below_pause)
+                until = ResetUntilPanel(server, self._run.below_resets)
             self._joints = JointsPanel(server, self._run.actions.order + 0.5)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)

@@ -40,7 +40,7 @@ def first_states(task: TaskEnv, poses: NDArray[np.float32]) -> FirstStates:
 
 def _are_beyond(arms: list[Arm], env: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(K,) whether no arm reaches the point; False for NaN, which is a body that the env lacks."""
-    beyond = np.isfinite(points).all(axis=1)
+    beyond = np.asarray(np.isfinite(points).all(axis=1))
     for arm in arms:
         left = np.flatnonzero(beyond)
         beyond[left] = ~reaches(arm, env, points[left])

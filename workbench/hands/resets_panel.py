@@ -155,7 +155,7 @@ class ResetsPanel(PagePart[SessionView]):
             return
         poses = cloud.of(known.row)
         colours = _rgb(marks(cloud, known.row, known.body))
-        there = np.isfinite(poses).all(axis=-1)
+        there = np.asarray(np.isfinite(poses).all(axis=-1))
         points = (poses[there][:, :3] + known.offset).astype(np.float32)
         self._points.draw(points, colours[there])
         if self._ghosts_on:

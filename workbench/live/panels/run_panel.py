@@ -185,9 +185,9 @@ class RunPanel(PagePart[SessionView]):
             tests = get_args(Test)
             self._pause_test = choice(server, "It", ChoosePauseTest, "test", tests, tests[0])
             self._pause_level = Field(server, "Level", SetPauseLevel, "level", 0.0, step=0.1)
-            self.below_pause = self._pause_level.order + 0.5
-            """viser's order of what comes after the condition to pause, in `episode`."""
             self._resets = gui.add_html("")
+            self.below_resets = self._resets.order + 0.5
+            """viser's order of what comes after the buttons that reset, in `episode`."""
 
     def do(self, command: Command, visitor: Visitor) -> None:
         self._sliders.do(command)
