@@ -81,6 +81,8 @@ def test_rows_are_bounded_and_the_rest_is_counted() -> None:
         assert rules.serial > serial
         serial = rules.serial
     assert len(rules.rows) == MAX_PLACES and rules.more == 2 * MAX_PLACES
+    rules.report_breach("not-applied", "lost", None, ("task.py", 0, "lift"))
+    assert rules.rows[0].count == 2 and rules.more == 2 * MAX_PLACES, "a place that is kept is still counted"
 
 
 def test_after_an_edit_rows_that_are_not_broken_again_are_removed() -> None:

@@ -136,6 +136,16 @@ def test_a_shape_is_sent_once_for_all_episodes_that_share_it() -> None:
         here(other)
 
 
+def test_shared_shapes_look_like_the_given_ones_after_these_were_deleted() -> None:
+    """Python gives the id of a deleted mesh to a later one."""
+    shapes, material = SharedShapes(), Material((1, 1, 1, 1))
+    for size in range(20):
+        for _ in range(2):
+            vertices = np.full((3, 3), size, np.float32)
+            mesh, _ = shapes.shared(Mesh(vertices, np.zeros((1, 3), np.uint32)), material)
+            np.testing.assert_array_equal(mesh.vertices, vertices)
+
+
 def of_episode(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
     return lambda read: msgspec.structs.replace(read, episode=replace(read.episode, **changes))
 

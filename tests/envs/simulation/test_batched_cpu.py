@@ -77,6 +77,34 @@ def test_a_pose_with_nan_is_refused_with_the_name_of_the_body(pick_cubes: BaseEn
     pick_cubes.scene._gpu_fetch_all()
 
 
+@pytest.mark.filterwarnings("ignore:PhysxRigidDynamicComponent")
+def test_values_computed_from_a_state_that_is_nan_are_skipped_in_its_env_only(pick_cubes: BaseEnv) -> None:
+    """A task that blew up in one env computes NaN from it; the other envs continue, and a reset repairs this one."""
+    pick_cubes.reset(seed=[0, 1, 2, 3])
+    robot, cube = pick_cubes.agent.robot, pick_cubes.cube
+    cube._bodies[1].linear_velocity = [np.nan] * 3
+    pick_cubes.scene._gpu_fetch_all()
+    lost = cube.linear_velocity[:, :1]
+    assert lost.isnan().ravel().tolist() == [False, True, False, False]
+    row = torch.cat([robot.pose.raw_pose, robot.root.linear_velocity, robot.root.angular_velocity], 1) + lost
+    for by_tensor in (False, True):
+        row[:, 0] += 0.25
+        robot.set_qvel(robot.get_qvel() + lost)
+        cube.set_pose(Pose.create(cube.pose.raw_pose + lost))
+        if not by_tensor:
+            robot.set_pose(Pose.create(row[:, :7]))
+            robot.set_root_linear_velocity(row[:, 7:10])
+        else:
+            pick_cubes.scene.px.cuda_rigid_body_data.torch()[robot.root._body_data_index] = row
+        pick_cubes.scene._gpu_apply_all()
+        roots = np.array([articulation.root_pose.p for articulation in robot._objs])
+        assert np.isfinite(roots).all()
+        np.testing.assert_allclose(roots[[0, 2, 3]], row[[0, 2, 3], :3], atol=1e-6)
+        pick_cubes.scene._gpu_fetch_all()
+    pick_cubes.reset(seed=[0, 1, 2, 3])
+    assert pick_cubes.get_state().isfinite().all()
+
+
 def test_a_velocity_of_a_kinematic_actor_is_not_passed_to_physx(pick_cubes: BaseEnv) -> None:
     pick_cubes.reset(seed=[0, 1, 2, 3])
     for actor in (pick_cubes.goal_site, pick_cubes.cube):
