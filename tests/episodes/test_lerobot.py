@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from workbench.episodes.episode import BrokenFile, Episode
+from workbench.episodes.films import MAX_FRAMES, FilmPart
 from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
 from workbench.episodes.lerobot.format import Choice, frames_of
 from workbench.episodes.lerobot.read import lerobot_rows, read_lerobot
@@ -141,6 +142,11 @@ def test_only_successes_are_exported_on_request(
     only = ExportOptions(only_successes=True)
     made = export(tmp_path / "set", episode, succeeding, options=only)
     assert (made.episodes, made.left_out) == (1, 1)
+    (row,) = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    # LeRobot finds an episode's rows, its films and its own row by these.
+    parts = ("data", "meta/episodes", *(key.rpartition("/")[0] for key in row if key.startswith("videos/")))
+    places = {f"{part}/{index}": 0 for part in parts for index in ("chunk_index", "file_index")}
+    assert row.items() >= places.items() and len(places) > 4
     with pytest.raises(ValueError, match="none of them reaches success"):
         export(tmp_path / "none", episode, options=only)
     assert not (tmp_path / "none").exists()
@@ -221,6 +227,17 @@ def test_a_playlist_as_video_reads_no_other_file(episode: Episode, tmp_path: Pat
         assert pictures is not None
         with pytest.raises(UnreadableRecording, match="cannot be read"):
             pictures[0]
+
+
+@pytest.mark.parametrize(
+    ("begin", "count", "fps"),
+    [(-0.1, 3, 20), (1e9, 3, 20), (np.nan, 3, 20), (0, -1, 20), (0, MAX_FRAMES + 1, 20)]
+    + [(0, 3, fps) for fps in (0, -20, 1e6, np.inf, np.nan)],
+)
+def test_claims_of_a_part_of_a_film_are_bounded(begin: float, count: int, fps: float) -> None:
+    FilmPart(Path("film.mp4"), 0.0, 3, 20.0)
+    with pytest.raises(ValueError, match=r"film\.mp4"):
+        FilmPart(Path("film.mp4"), begin, count, fps)
 
 
 def test_claims_of_a_dataset_are_bounded(episode: Episode, tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from workbench.envs.scene.shapes import SceneGeometry
-from workbench.episodes.rerun.entities import body_entities
+from workbench.episodes.rerun.entities import body_entities, series_names
 
 NAME = st.text(st.sampled_from("ab/ c.ä"), max_size=6) | st.sampled_from(["cameras", "cameras/a", "a/b", "a"])
 
@@ -18,6 +19,12 @@ def entities(*names: str) -> tuple[str, ...]:
 
 def test_entities_are_named_after_bodies() -> None:
     assert entities("cube", "panda/panda_hand") == ("/world/cube", "/world/panda/panda_hand")
+
+
+def test_series_are_named_in_the_order_in_which_their_numbers_are_written() -> None:
+    for shape in ((), (2,), (2, 3), (3, 1, 2)):
+        names = series_names("m", np.zeros((4, *shape)))
+        assert names == [f"m{list(index)}" if index else "m" for index in np.ndindex(shape)]
 
 
 @given(st.lists(NAME, max_size=6).map(tuple))

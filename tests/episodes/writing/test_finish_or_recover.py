@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.episodes import Made
+from tests.drive.episodes import Made, journal_of
 from tests.drive.rows import append
 from tests.episodes.refused_calls import descriptors, left_open, refused
 from workbench.episodes.reader.read_episode import read_episode
@@ -91,3 +91,21 @@ def test_whatever_call_fails_when_an_episode_begins_is_reported(
         assert left_open(before) == [], call
         recover(folder)
         assert not folder.exists() or os.listdir(folder) == [], call
+
+
+@pytest.mark.parametrize("lost", [1, 3])
+def test_an_episode_of_which_the_disk_lost_states_is_not_exported_and_keeps_its_journal(
+    make_episode: Maker, tmp_path: Path, lost: int
+) -> None:
+    episode, ends = make_episode(6), []
+    writer = episode.writer(tmp_path)
+    for row in episode.rows():
+        append(writer, row)
+        journal_of(writer).write()
+        ends.append(journal_of(writer).size)
+    os.truncate(journal_of(writer).path, ends[-1 - lost])
+    with pytest.raises(RecordingError):
+        writer.finish()
+    assert [path.name for path in tmp_path.iterdir()] == [FOLDER]
+    (made,) = recover(tmp_path)
+    assert read_episode(made.json).length == 6 - lost
