@@ -102,6 +102,14 @@ def test_the_fold_names_the_number_of_envs_and_their_device(form: Form) -> None:
     assert label.endswith("4 envs, cpu")
 
 
+def test_options_that_were_applied_elsewhere_replace_those_in_the_form(form: Form) -> None:
+    """By another tab, or by Undo: else Apply would bring the old number of envs back."""
+    form.set("Envs", 8)
+    form.view = replace(form.view, options=TaskOptions(16))
+    form.draw()
+    assert form.panels.field("Envs").value == 16 and not form.panels.shows("Discard", "button")
+
+
 def test_only_changed_options_are_applied_all_at_once(form: Form) -> None:
     form.set("Envs", 8)
     form.set("size", 0.001)

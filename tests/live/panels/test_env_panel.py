@@ -119,6 +119,20 @@ def test_a_new_filter_or_order_starts_on_the_first_page(table: Table) -> None:
     )
 
 
+def test_every_column_is_as_wide_as_its_longest_cell(table: Table) -> None:
+    """Else a narrow panel cuts numbers off in place of leaving out a column."""
+
+    def width(**changes: Any) -> int:
+        table.show(table.live.session.shown.step_serial + 1, rows=many(**changes))
+        return max(map(int, re.findall(r"max-width: (\d+)px", table.html)))
+
+    entries = {name: np.zeros(MANY, np.int32) for name in ("far", "near", "on")}
+    usual, big = width(first=entries), np.full(MANY, 10**9)
+    assert width(first=entries, steps=big) > usual
+    for name in entries:
+        assert width(first={**entries, name: big}) > usual, name
+
+
 def test_a_step_reaches_the_table_with_a_delay_and_a_press_at_once(table: Table) -> None:
     before = table.html
     later = many(steps=np.full(MANY, 5, np.int32))
