@@ -42,6 +42,7 @@ KEPT = f"{LAZY}            self.begun[env_idx] = cube\n"
 MINE = "            if len(env_idx) < self.num_envs: raise ValueError('my own mistake')\n"
 
 
+@pytest.mark.usefixtures("renderer")
 @pytest.mark.parametrize(
     "edit",
     [
@@ -89,9 +90,31 @@ def test_a_quaternion_that_is_not_normalised(checked: Checked) -> None:
     edit = CUBE_POSE, CUBE_POSE.replace("[1, 0, 0, 0]", "[1, 0, 0, 1]")
     finding = the_finding(checked("unit-quaternion", edit))
     assert "has length 1.41" in finding.message and "[1, 0, 0, 1]" in finding.code
+    last = CUBE_POSE.replace(
+        "[1, 0, 0, 0]", "torch.eye(4)[[0] * b] * torch.arange(1, b + 1).clamp(max=2)[:, None]"
+    )
+    finding = the_finding(checked("unit-quaternion", (CUBE_POSE, last)))
+    assert "has length 2" in finding.message and "(2, 0, 0, 0)" in finding.message, "the first env's is right"
 
 
-def test_a_robot_that_cannot_hold_itself(checked: Checked) -> None:
+DOOR = """door = self.scene.create_articulation_builder()
+        frame = door.create_link_builder()
+        frame.set_name("frame")
+        leaf = door.create_link_builder(frame)
+        leaf.set_name("leaf")
+        leaf.set_joint_name("hinge")
+        leaf.add_box_collision(half_size=[0.1] * 3)
+        leaf.set_joint_properties("revolute", [[-9, 9]], sapien.Pose(), sapien.Pose([0, 0.5, 0]), 0.0, 0.0)
+        door.initial_pose = sapien.Pose([0, 3, 1])
+        self.door = door.build("door", fix_root_link=True)
+        super()"""
+
+
+@pytest.mark.parametrize("before", ["super()", DOOR], ids=["alone", "after a door that falls open"])
+def test_a_robot_that_cannot_hold_itself(checked: Checked, before: str) -> None:
+    load = "super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))\n"
+    if before is DOOR:
+        assert checked("robot-holds", (load, load.replace("super()", before)), seeds=4).state == "kept"
     weak = """super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
         for link in self.agent.robot.links:
             link.disable_gravity[:] = False
@@ -100,11 +123,7 @@ def test_a_robot_that_cannot_hold_itself(checked: Checked) -> None:
         for joint in self.agent.robot.active_joints:
             joint.set_drive_properties(1.0, 1.0)
 """
-    finding = the_finding(
-        checked(
-            "robot-holds", ("super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))\n", weak), seeds=4
-        )
-    )
+    finding = the_finding(checked("robot-holds", (load, weak.replace("super()", before)), seeds=4))
     assert "panda_joint" in finding.message and finding.function == "_initialize_episode"
 
 

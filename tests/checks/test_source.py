@@ -37,6 +37,22 @@ def source_results(folder: Path, *edits: tuple[str, str]) -> dict[str, RuleResul
     return check_rules(rules, str(folder / "task.py"), num_envs=2, seeds=1, render_backend="none")
 
 
+@pytest.mark.parametrize(
+    ("env_id", "advised"),
+    [
+        ("PushCup-v1.5", "PushCup-v1"),
+        ("PushCup-v", "PushCup-v1"),
+        ("PushCup-v2x", "PushCup-v2x-v1"),
+        ("PushCup-v12", None),
+    ],
+)
+def test_an_id_ends_in_a_version_that_is_a_whole_number(
+    env_id: str, advised: str | None, checked: Checked
+) -> None:
+    result = checked("versioned-id", ("WorkbenchPushCube-v1", env_id))
+    assert [repr(advised) in finding.message for finding in result.findings] == [True] * (advised is not None)
+
+
 def lines(place: str, *statements: str) -> tuple[str, str]:
     """An edit that adds statements below the line `place`."""
     indent = place[: len(place) - len(place.lstrip())]

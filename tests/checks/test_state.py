@@ -180,6 +180,10 @@ def test_findings_of_the_previous_version_stay_until_their_rule_is_checked(
         FIRST,
         SECOND,
     ] and checks.view.of(ChecksView).findings == ()
+    checks.session.happen(FileSaved())
+    load(checks, NEXT_TEXT + "\n")
+    both = [FIRST, SECOND]
+    assert [one.rule for one in checks.view.of(ChecksView).before] == both, "no rule was checked in between"
     background.let.release()
     until(lambda: len(checks.view.of(ChecksView).results) == 1, "the first rule")
     assert [one.rule for one in checks.view.of(ChecksView).before] == [SECOND]
