@@ -125,6 +125,17 @@ def test_a_head_above_the_size_limit_is_refused(gated_server, head):
     assert both(gated_server) == (200, 101)
 
 
+def test_the_size_of_a_head_is_that_of_all_its_pieces(gated_server):
+    """Else a stranger makes the server keep a megabyte per connection, a line at a time."""
+    with connected(gated_server) as large:
+        large.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        with contextlib.suppress(OSError):
+            for number in range(strangers.MAX_HEAD_BYTES // 4000 + 1):
+                large.sendall(b"X-%d: " % number + b"y" * 4000 + b"\r\n")
+            large.sendall(b"\r\n")
+        assert large.recv(100).startswith(b"HTTP/1.1 431 ")
+
+
 def test_cookies_of_many_other_programs_fit_into_the_head(gated_server):
     others = "; ".join(f"other-{number}={'x' * 3000}" for number in range(2))
     assert both(gated_server, Cookie=f"{others}; {cookie_of(gated_server)}") == (200, 101)

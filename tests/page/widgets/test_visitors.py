@@ -131,12 +131,18 @@ def test_invalid_fields_are_refused_with_a_reason_and_the_next_command_runs(
     assert [command for _, command in house.came] == [SetSeed(seed=12)]
 
 
-def test_a_failing_command_affects_nothing_else(house: House, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_command_affects_nothing_else_and_its_page_is_told(
+    house: House, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(Visitor, "tell", lambda visitor, *words: told.append(visitor.name))
     with house.open(house.names()[0]) as channel:
         say(channel, 1, "toggle_play")
         say(channel, 2, "step")
         assert reply(channel)["refused"] and reply(channel) == {"n": 2}
-    assert "of a test" in caplog.text
+        say(channel, 3, "select_env", env=4)
+        assert reply(channel)["refused"]
+    assert "of a test" in caplog.text and told == 2 * house.names()[:1]
 
 
 @pytest.mark.parametrize(
