@@ -150,6 +150,21 @@ def test_references_are_followed_through_several_names() -> None:
             "may keep",
         ),
         ("def evaluate(self):\n    return {{'w': self.kept.setdefault('w', {n})}}\n", "", "setdefault"),
+        *(
+            (
+                f"def evaluate(self):\n    new = {alias}\n    if self.done:\n        new[0] = {{n}}\n    return {{{{}}}}\n",
+                "",
+                "may keep",
+            )
+            for alias in (
+                "torch.from_numpy(self.kept)",
+                "torch.as_tensor(self.kept)",
+                "torch.relu_(self.kept)",
+                "self.kept[0]",
+                "self.kept",
+                "self._table()",
+            )
+        ),
         (
             "@functools.lru_cache\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table()}}\n",
             "",
@@ -197,6 +212,12 @@ def test_references_are_followed_through_several_names() -> None:
             "def __init__(self):\n    super().__init__()\n    self.w = self.first\ndef evaluate(self):\n    self.first = {n}\n    return {{}}\n",
             "",
             "super().__init__()",
+        ),
+        # The function that keeps the value did not change.
+        (
+            "def _kept(self, w):\n    if self.w is None:\n        self.w = w\n    return self.w\ndef evaluate(self):\n    return {{'w': self._kept({n})}}\n",
+            "",
+            "_kept may keep",
         ),
         (
             "def __getattr__(self, name):\n    return 1\ndef evaluate(self):\n    return {{'w': self.x + {n}}}\n",

@@ -208,6 +208,22 @@ def test_a_number_that_stays_the_same_keeps_its_text() -> None:
     assert isinstance(plan, SourceEdit) and "[0.450, 0.25, 0.90]" in plan.new_text
 
 
+def test_a_rename_notes_the_places_that_still_have_the_old_name() -> None:
+    for text, count in ((TWO, 0), (TWO + '\nSHOWN, OTHERS = ["cam", \'cam\'], "cameras"\n', 2)):
+        plan = planned(plan_rename, {FILE: text}, KEY, "front", real_settings({FILE: text}, "cam"), run_class)
+        assert isinstance(plan, SourceEdit) and plan.notes
+        notes = [note for note in plan.notes if "'cam'" in note]
+        assert len(notes) == bool(count) and all(f" {count} " in note for note in notes)
+
+
+def test_a_camera_to_copy_is_mounted_where_the_refused_one_is() -> None:
+    source = WRITTEN["Pose.create_from_pq in a robot"]
+    before = dataclasses.replace(real_settings({FILE: source}, "cam"), fov=0.5)  # other code sets it
+    after = dataclasses.replace(before, fov=0.7)
+    plan = planned(plan_edit, {FILE: source}, KEY, before, after, run_class)
+    assert isinstance(plan, RefusedEdit) and 'entity_uid="gripper_link"' in plan.snippet
+
+
 def test_a_removed_camera_takes_its_comment_with_it() -> None:
     plan = planned(plan_remove, {FILE: TWO}, KEY, run_class)
     assert isinstance(plan, SourceEdit)
