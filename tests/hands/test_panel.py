@@ -143,8 +143,11 @@ def test_the_handles_are_shown_at_the_body_while_nothing_plays(live_page: Live) 
     live_page.do(ToggleHandles())
     live_page.show(view)
     assert gizmo.visible
-    live_page.show(replace(view, playing=True))
-    assert not gizmo.visible
+    for shown in (replace(view, playing=True), replace(view, timeline=replace(view.timeline, shown=30))):
+        live_page.show(shown)
+        assert not gizmo.visible, "what a past moment or a running env holds is not moved"
+        live_page.show(view)
+        assert gizmo.visible
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,9 +19,12 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.envs import CPU
+from tests.drive.waiting import until
 from workbench.episodes.episode import NO_SEED, Episode
 from workbench.episodes.reader.read_episode import read_episode, read_maniskill
+from workbench.episodes.writing import episode_writer
 from workbench.episodes.writing.finish_or_recover import recover
+from workbench.episodes.writing.publish import RecordingError
 from workbench.machine.processes.family import children
 
 TASKS = Path(__file__).parents[2] / "tasks"
@@ -143,6 +147,26 @@ def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
     env.step(env.action_space.sample())
     assert env.problem is not None and env.episodes_written == 0
     env.close()
+
+
+def test_files_that_cannot_be_made_end_the_recording_with_one_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*args: Any, **named: Any) -> None:
+        raise RecordingError("the disk is full")
+
+    env = workbench.Recorder(workbench.make("PushCube-v1", 2, **CPU), tmp_path)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    with monkeypatch.context() as patched, pytest.warns(UserWarning, match="the disk is full") as warned:
+        patched.setattr(episode_writer, "make_files", fails)
+        env.reset(seed=1)
+        until(lambda: env.step(env.action_space.sample()) and env.problem, "the problem")
+    for _ in range(2):
+        env.reset(seed=2)
+        env.step(env.action_space.sample())
+    env.close()
+    assert len(warned) == 1 and env.episodes_written == 0 and not list(tmp_path.glob("*.h5"))
 
 
 def test_steps_before_an_unseen_reset_are_kept(tmp_path: Path) -> None:
