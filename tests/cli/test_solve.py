@@ -14,6 +14,7 @@ import termios
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -23,15 +24,18 @@ from workbench.checks.job import CheckReport
 from workbench.checks.job_items import CheckedTask
 from workbench.checks.results import RuleResult
 from workbench.cli.main import main
-from workbench.cli.solve import SolveOutput, as_junit
+from workbench.cli.output import Exit
+from workbench.cli.solve import SolveOutput, as_junit, solve_in_terminal
 from workbench.envs.gpu_rules import FailOn, Finding
 from workbench.episodes.reader.read_episode import read_episode
+from workbench.jobs.scheduler import Failure
 from workbench.planning.options import PlanOptions
 from workbench.planning.seeds_report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import RewardVerdict
 from workbench.record.job import RecordProgress
 from workbench.solve.job import SolveOptions, solve
 from workbench.task.description import TaskOptions
+from workbench.task.problem import Problem
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -214,6 +218,19 @@ def test_ctrl_c_in_a_terminal_keeps_and_reports_the_finished_seeds(lift: Path) -
     assert report["stopped"] and 2 <= report["tried"] == count < 500
     assert f"{count} of 500 seeds are done, {report['solved']} solved" in printed()
     assert "interrupted; finished episodes were kept" in printed() and "Traceback" not in printed()
+
+
+@pytest.mark.parametrize("failing", [True, False])
+def test_seeds_without_a_result_make_the_exit_code_1_whatever_the_degree(
+    failing: bool, lift: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def solved(*args: Any, on_failures: Any, **named: Any) -> SolveReport:
+        on_failures([Failure((1,), Problem("worker", "it was killed", None, None, None, ""))] * failing)
+        return FOUND
+
+    monkeypatch.setattr("workbench.cli.solve.solve", solved)
+    code = solve_in_terminal(options_of(lift), SolveOutput(fail_on="never"))
+    assert code == (Exit.FAILED if failing else Exit.DONE)
 
 
 def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.CaptureFixture[str]) -> None:
