@@ -218,7 +218,5 @@ def test_a_folder_that_a_machine_does_not_see_is_refused(
 ) -> None:
     # Simulates a machine with its own folder of this name.
     monkeypatch.setattr(Path, "touch", lambda path: None)
-    with pytest.raises(
-        PoolError, match="does not see the folder .*there of this machine: give one that all machines"
-    ):
+    with pytest.raises(PoolError, match="does not share the folder .*there: give a folder that all machines"):
         record(wanted("there"), executor=Cluster(address, 1))

@@ -303,7 +303,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             ## Why
             After a step the tensors of state still hold the values from before it, until they are fetched. An
             apply writes the whole tensors to the simulation. So everything that moved in that step is put
-            back, in all envs, and the episode stands still or jitters.
+            back, in all envs: the bodies do not move, or jitter.
 
             ## Mend
             Fetch, write, apply, and fetch again.
@@ -328,7 +328,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "state-while-built",
             "warn",
             "_load_scene",
-            """State (poses, velocities, qpos, drive targets) is read and set once the scene is complete: in
+            """State (poses, velocities, qpos, drive targets) is read and set only after the scene is complete: in
             _after_reconfigure or _initialize_episode.
 
             The build fails: there are no tensors of state yet.

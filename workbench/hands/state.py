@@ -96,7 +96,7 @@ class DrivingDue:
 
 @dataclass(frozen=True)
 class DraggedJoint:
-    """A joint whose slider is dragged while the envs stand still."""
+    """A joint whose slider is dragged while the envs are paused."""
 
     robot: str
     """As in `RobotDescription.name`."""
@@ -135,7 +135,8 @@ class Hands:
     next_seed: int = 0
     """Minimum seed of the next episode of the set."""
     kept: Moment | None = None
-    """Last moment of the episode that was kept last: one that was taken up again and driven on is kept anew."""
+    """Last moment of the episode that was kept last. After the episode was continued, its last moment is another,
+    so it can be kept again."""
     note: str = ""
     """What became of the last episode of the set."""
 
@@ -340,7 +341,7 @@ def _handle(event: BodyMoved | BodyPulled, run: Run) -> list[Any]:
         case BodyMoved(body=body, env_idx=env_idx, pose=pose):
             _require_live(run)
             if run.playing:
-                raise Refused("Pause first: a body is moved while the envs stand still.")
+                raise Refused("Pause first: bodies can be moved only while the envs are paused.")
             if why := why_not_moved(_kind_of(run, body)):
                 raise Refused(why)
             _require_pose(pose)
@@ -395,7 +396,7 @@ def _use_keyframe(hands: Hands, run: Run, name: str, keyframe: str) -> Send:
     if found is None:
         raise Refused(f"{name} has no keyframe {keyframe}.")
     if run.playing:
-        raise Refused("Pause first: a keyframe is set while the envs stand still.")
+        raise Refused("Pause first: a keyframe can be set only while the envs are paused.")
     every, how = tuple(range(len(robot.joints))), f"{name} was put into its keyframe {keyframe} by hand."
     return Send(
         MoveJoints(

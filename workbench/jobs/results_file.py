@@ -205,7 +205,9 @@ class JobParts:
         try:
             return Unpacker().unpack(self.request, kind)
         except Unreadable as error:
-            raise JobFileError(f"{self.files[0]} holds a request that cannot be read ({error})") from error
+            raise JobFileError(
+                f"{self.files[0]} has options of the command that cannot be read ({error})"
+            ) from error
 
     def results(self, kind: Any) -> dict[int, Any]:
         """Results by item. Raises JobFileError."""

@@ -359,7 +359,7 @@ def checked_intrinsic(matrix: ArrayLike) -> Floats:
     if np.abs(k[2] - [0, 0, 1]).max() > 1e-9 or abs(k[1, 0]) > 1e-9:
         raise ValueError("an intrinsic matrix is fx 0 cx, 0 fy cy, 0 0 1 in its three rows")
     if k[0, 0] <= 0 or k[1, 1] <= 0:
-        raise ValueError(f"focal lengths are positive, not {k[0, 0]:.6g} and {k[1, 1]:.6g} pixels")
+        raise ValueError(f"focal lengths must be positive, not {k[0, 0]:.6g} and {k[1, 1]:.6g} pixels")
     if abs(k[0, 1]) > 1e-6 * k[0, 0]:
         raise ValueError(f"a skew of {k[0, 1]:.6g} pixels cannot be rendered: ManiSkill ignores it")
     return k

@@ -108,7 +108,9 @@ def _camera(env: Any, key: CameraKey) -> Any:
     if moved := maniskill_private.why_not(maniskill_private.PLACING):
         raise ValueError(moved)
     if not maniskill_private.camera_components(camera):
-        raise ValueError(f"{name!r} is not a plain camera, and only plain cameras can be placed")
+        raise ValueError(
+            f"{name!r} is a stereo camera or a sensor class of the task: only ordinary cameras can be placed"
+        )
     if env.scene.gpu_sim_enabled and batched_system(env.scene) is None:
         raise ValueError(NOT_ON_THE_GPU)
     return camera

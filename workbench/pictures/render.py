@@ -40,7 +40,7 @@ Request = tuple[str, CameraKind, Sequence[str]]
 def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
     """All cameras of a ManiSkill env: its sensors (the robot's too), then its human render cameras.
 
-    Empty without a render device. Sensors that are not plain cameras are left out.
+    Empty without a render device. Stereo cameras and sensor classes of the task are left out.
     """
     infos = []
     for (kind, name), camera in cameras_of(env).items():
@@ -246,7 +246,7 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
 
 
 def cameras_of(env: Any) -> dict[CameraKey, Any]:
-    """The plain cameras of an env."""
+    """The cameras of an env, without stereo cameras and sensor classes of the task."""
     return {
         key: camera
         for key, camera in maniskill_private.cameras(env).items()

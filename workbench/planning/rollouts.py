@@ -44,7 +44,7 @@ def require_plannable(env: BaseEnv) -> None:
     """Raise NothingToPlan if the task cannot be planned; builds nothing."""
     if env.reward_mode == "none":
         raise NothingToPlan(
-            "there is nothing to plan: the task has no reward, and actions are planned by the reward"
+            "there is nothing to plan: the planner maximises the reward, and the task has none"
         )
     if not actions.action_parts(env):
         raise NothingToPlan("there is nothing to plan: the task has no robot with a controller")

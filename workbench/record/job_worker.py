@@ -211,8 +211,8 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
             folder = Path(os.fsdecode(setup.folders[at]))
             if setup.mark and not what.upload and not (folder / setup.mark).exists():
                 raise RecordingError(
-                    f"{platform.node()} does not see the folder {folder} of this machine: give one that all machines of "
-                    "the cluster share, or an address such as s3://bucket/folder"
+                    f"{platform.node()}, a machine of the cluster, does not share the folder {folder}: give a folder that "
+                    "all machines of the cluster share, or an address such as s3://bucket/folder"
                 )
             drawn: dict[str, Drawing] = {}
             with drawings.taken_into(drawn):

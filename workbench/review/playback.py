@@ -298,7 +298,7 @@ def _changed_files(files: Mapping[Path, FileStamp]) -> list[str]:
         now = _size_and_time(path)
         if now is None and stamp.size_and_time is not None:
             found.append(
-                f"{path.name} was deleted since it was opened; the content that was read is still shown."
+                f"{path.name} was deleted after it was opened; the page still shows the content that was read."
             )
         elif now != stamp.size_and_time:
             found.append(

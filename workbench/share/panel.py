@@ -249,9 +249,9 @@ def will_make(
         known, note = chosen.successes, ""
         if known == 0:
             note = (
-                "It does not reach success."
+                "This recording does not reach success."
                 if len(names) == 1
-                else "None of them reaches success: all are included."
+                else "None of these recordings reaches success: all are included."
             )
         elif only_successes and known is not None and known < len(names):
             of = f"of the {known} of these {len(names)} recordings that reach success"

@@ -473,7 +473,7 @@ def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTa
         **_source_fields(finder),
     )
     task = dataclasses.replace(task, default_kwargs={**task.default_kwargs, **chosen.kwargs})
-    # The empty scene's limit of 200,000 steps is no episode length.
+    # A robot without a task is shown in ManiSkill's empty scene, whose limit of 200,000 steps is no episode length.
     return task if task.robot is None else dataclasses.replace(task, max_episode_steps=None)
 
 
@@ -554,8 +554,8 @@ def _module_hint(name: str, finder: AuthorFinder) -> str:
     top = name.partition(".")[0]
     if Path(f"{top}.py").is_file() or Path(top, "__init__.py").is_file():
         return (
-            f"there is one in the folder where the command was started, which is not searched: move {top} into the "
-            "file's folder, or add its folder to PYTHONPATH"
+            f"{top} is in the folder where the command was started, which is not searched: move {top} into the task "
+            "file's folder, or add the folder to PYTHONPATH"
         )
     siblings = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
     if finder.only_given and name.rpartition(".")[2] in siblings:

@@ -268,7 +268,7 @@ class _Comparison:
         for key, by in running.items():
             if by is not None and key not in family and self._versions.by_key[key][0].kind == "class":
                 raise _NeedsRebuild(
-                    f"{self._label(by)} uses the class {self._label(key)}, of which old instances may exist"
+                    f"{self._label(by)} uses the class {self._label(key)}, and instances of its old version may exist"
                 )
 
     def _refuse_memoized(self, affected: set[Key]) -> None:

@@ -57,7 +57,7 @@ def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
     return (
         None
         if axes is None or axes.value == "sxyz"
-        else f"`{changes.one_line(q.at)}` uses other axes than sxyz"
+        else f"`{changes.one_line(q.at)}` uses Euler axes other than sxyz"
     )
 
 

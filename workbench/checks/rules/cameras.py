@@ -322,7 +322,8 @@ def sensor_configs(checkup: Checkup) -> tuple[list[Any], list[Any]]:
 
 
 def hook_configs(checkup: Checkup) -> dict[CameraKey, Any]:
-    """Evidence for `Checkup.look`: configs of all plain cameras, as the hooks return them. Needs no renderer."""
+    """Evidence for `Checkup.look`: configs of all cameras (of no other sensors), as the hooks return them. Needs no
+    renderer."""
     maniskill_private.mark_camera_configs()
     checkup.reset(checkup.task, checkup.seeds[0])
     with blamed("cameras", checkup.loaded, checkup.task):

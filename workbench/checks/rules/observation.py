@@ -1,4 +1,4 @@
-"""Checks of the observation: what a policy reads, and what it should or should not be told."""
+"""Checks of the observation: whether a policy can use its numbers."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ HUGE_NUMBER = 1000.0
 
 
 def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each leaf in random rollouts; if all leaves are finite there, also a row for the first leaf
-    that is not finite in odd states."""
+    """A row for each leaf of the observation in random rollouts; if all leaves are finite there, also a row
+    for the first leaf that is not finite in `odd_states`."""
     finite = True
     for name, rows in _leaves(checkup).items():
         bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
@@ -66,7 +66,7 @@ def observation_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_observation_constant(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each leaf in random rollouts and odd states, with its numbers if none of them changes."""
+    """A row for each leaf in random rollouts and `odd_states`, with its numbers if none of them changes."""
     seen = checkup.look(odd_states)
     yield Seen(tried=len(checkup.seeds))
     for name, rows in _leaves(checkup).items():

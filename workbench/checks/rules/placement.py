@@ -29,7 +29,7 @@ MOVED_METRES, TURNED_RADIANS = 0.02, 0.35
 """Metres that a body may move and radians that it may turn in a second: a body that is put down 1 cm above
 the table may settle."""
 MOVING_SPEED = 0.01
-"""Velocity after a reset, in m/s or rad/s, above which the task wants the body to move."""
+"""Velocity after a reset, in m/s or rad/s, above which the motion counts as intended."""
 SAG_LIMITS = {"prismatic": 0.02, "revolute": 0.1}
 """Metres and radians that a joint may move in a second."""
 POSTURES = 40
@@ -74,15 +74,16 @@ def see_overlaps_at_reset(checkup: Checkup) -> Iterator[Seen]:
 def overlap_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Bodies do not overlap after a reset.
 
-    Bodies are pushed apart in the first steps, often far away, and the policy learns from that.
+    Physics pushes the bodies apart in the first steps, often far away, and the policy learns from these
+    steps.
 
     ## Why
-    Bodies inside each other are pushed apart in the first steps, often with great speed. The episode begins
-    in another state than the one that the reset sets. The reward sees a body that moves by itself, and a
-    policy learns to use that.
+    Physics pushes overlapping bodies apart in the first steps, often at high speed. The episode begins in
+    another state than the one that the reset sets. The motion of these bodies changes the reward, and a
+    policy learns to exploit this.
 
     ## Mend
-    Place the middle of a body at half its height, and draw places that are apart.
+    Set z of a body to half of its height, and sample places that do not overlap.
 
     ```python fragment
     p = torch.zeros((b, 3))
@@ -233,8 +234,8 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     After a step, the rule resets env 0 alone, and then all others. If a reset raises, or breaks a rule of GPU
     simulation, at a line of the task's `_initialize_episode` that uses a tensor of `self.num_envs` rows, the
-    rule reports the line that makes this tensor. It accepts a tensor of which only the rows `[env_idx]` are
-    used. The result is *not known* if the task raises elsewhere or cannot be built, and with one env.
+    rule reports the line that makes this tensor. The rule accepts such a tensor if only its rows `[env_idx]`
+    are used. The result is *not known* if the task raises elsewhere or cannot be built, and with one env.
     """
     checkup.require_several()
     task, rng = checkup.task, np.random.default_rng(4)
@@ -552,7 +553,7 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
         raise NotApplicable("the robot moves around")
     tool = getattr(robots[0], "tcp", None)  # an error in the author's property is reported
     if not isinstance(tool, Link):
-        raise NotKnown("the robot has no tcp, of which the reach is measured")
+        raise NotKnown("the robot has no tcp, and the reach is the largest distance of the tcp from the base")
     base, reach = _reach(checkup, robots[0].robot, tool)
     index, poses = scene_index(task.env), checkup.starts.poses[0]
     for body, name in enumerate(index.names):

@@ -90,7 +90,8 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     reproduced, and evaluations on fixed seeds measure luck.
 
     ## Mend
-    Draw with torch in `_initialize_episode`, where it is seeded, and set everything that an episode changes.
+    Draw random numbers with torch in `_initialize_episode`, where torch is seeded, and set everything that an
+    episode changes.
 
     ```python fragment
     def _initialize_episode(self, env_idx, options):

@@ -39,7 +39,7 @@ STILL_TOLERANCE = 1e-5
 def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """_load_agent gives the robot an initial pose.
 
-    The robot is built at the origin, inside whatever stands there, and the GPU simulation starts with the
+    The robot is built at the origin, inside the bodies that are there, and the GPU simulation starts with the
     collision.
 
     ## Why
@@ -471,16 +471,16 @@ def _require_read(unknown: list[str]) -> None:
 def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
     """If actors are made for each env and merged, only the merged actor is in the state.
 
-    The state dict has leaves with another batch size: it cannot be saved, sliced or restored.
+    The state dict has entries with another batch size: it cannot be saved, sliced or restored.
 
     ## Why
     Objects that differ from env to env are built one by one and merged. For each part, the state dict then
-    still has a leaf of one row, next to leaves of N rows. Such a state cannot be sliced by env, written to a
+    still has an entry of one row, next to entries of N rows. Such a state cannot be sliced by env, written to a
     trajectory file of all envs, or restored in another env. If the merged body is not in the state at all,
     replays do not restore its pose.
 
     ## Mend
-    Take the parts out of the state, and put the merged body in.
+    Remove the parts from the state dict, and add the merged actor.
 
     ```python fragment
     self.peg = Actor.merge(pegs, name="peg")
@@ -536,16 +536,17 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
     Poses are wrong and sensors see what should be hidden, or every picture fails.
 
     ## Why
-    GPU simulation hides an actor by moving it 99999 m away; ManiSkill keeps the real pose on that actor. A
-    merged actor does not know that its parts are hidden: its `pose` is 99999 m off, in `evaluate()` and in
-    the observation, and setting its pose brings the parts back into the view of the sensors for good. The CPU
-    backends, stock and batched, do not show this, since they hide an actor by its visibility.
+    GPU simulation hides an actor by moving it 99999 m away; ManiSkill keeps the real pose on that actor. If
+    only the parts of a merged actor are hidden, ManiSkill keeps no real pose for the merged actor: its `pose`
+    is 99999 m off, in `evaluate()` and in the observation, and setting its pose brings the parts back into
+    the view of the sensors for good. The CPU backends, stock and batched, do not show this, since they hide
+    an actor by its visibility.
 
     An articulation, a static actor, an actor with collision shapes, and a merged actor that may have
     collision shapes cannot be hidden at all: every picture of a sensor fails.
 
     ## Mend
-    Hide the merged actor, and declare that it does not collide, since ManiSkill does not find that out by
+    Hide the merged actor, and declare that this actor does not collide: ManiSkill does not determine that
     itself.
 
     ```python fragment
@@ -582,7 +583,7 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
             yield Found(
                 f"{_several([part.name for part in parts], 'is', 'are')} hidden, and {merged.name}, which "
                 f"{'it is' if len(parts) == 1 else 'they are'} merged into, is not: on a GPU hiding moves a body 99999 m away, "
-                f"so the pose of {merged.name} is wrong, and sensors see it again once its pose is set. Hide the merged actor "
+                f"so the pose of {merged.name} is wrong, and sensors see it again after its pose is set. Hide the merged actor "
                 f"instead: {name}.has_collision_shapes = False, then self._hidden_objects.append({name}).",
                 _hiding_line(checkup, parts[0]),
                 len(parts),
@@ -620,8 +621,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     A scene is built when the env is made, and again only if `reconfiguration_freq` says so. With thousands of
-    envs each one has another object, and that is enough. One env, as in evaluation and in data collection,
-    has the same object forever.
+    envs each env has another object, which is variety enough. A single env, as in evaluation and in data
+    collection, has the same object forever.
 
     ## Mend
     Rebuild one env at each reset, and many envs never.
@@ -701,7 +702,7 @@ def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         yield Found(
             f"{row.names[0]} is up to {row.size:.1f} m from the middle of its env in {len(row.seeds)} of "
             f"{tried(rows)} episodes, and the envs are {2 * row.numbers[0]:g} m apart. Return "
-            f"`SimConfig(spacing={np.ceil(2.5 * row.size):g})` from _default_sim_config, or keep the body nearer.",
+            f"`SimConfig(spacing={np.ceil(2.5 * row.size):g})` from _default_sim_config, or keep the body closer to the middle.",
             row.place,
             len(row.seeds),
         )

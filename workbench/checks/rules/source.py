@@ -50,14 +50,14 @@ _GUARDS = {
 def registered(checkup: Checkup) -> Iterator[Found | Note]:
     """The class inherits BaseEnv and is registered with @register_env.
 
-    ManiSkill's own commands and trainers do not find the task, and many envs get no time limit; without any
-    id, gym.make cannot make it.
+    ManiSkill's own commands and trainers do not find the task, and a batch of envs gets no time limit;
+    without any id, gym.make cannot make the task.
 
     ## Why
     `gym.make`, ManiSkill's demos, its recording tools and every trainer make a task by its id. A class
-    without an id can be opened here and nowhere else: a job on a cluster that is given the id finds nothing.
-    Gymnasium's own `register` makes an id that only `gym.make` knows, and a time limit that a batch of envs
-    does not get. The rule reports such an id too; the workbench uses the id and its limit.
+    without an id can be opened only in the workbench. Gymnasium's own `register` makes an id that only
+    `gym.make` finds, and a time limit that a batch of envs does not get. The rule reports such an id too; the
+    workbench uses the id and its limit.
 
     ## Mend
     Write the decorator above the class.
@@ -68,7 +68,7 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule reads ManiSkill's table of ids after the file was imported; nothing runs. The result is *not
+    The rule reads ManiSkill's table of ids after the import of the file; no env is made. The result is *not
     applicable* for a robot that is shown in one of ManiSkill's scenes. The rule does not see an id that
     another file registers for the class, unless that file is imported too.
     """
@@ -279,14 +279,15 @@ def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
 
 @rule("unknown-name", "warn", "class")
 def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
-    """Attributes that are set on builders, and methods that are called on self and the scene, exist.
+    """Every attribute that is set on a builder exists, and so does every method that is called on self or
+    the scene.
 
-    A typo on a builder (inital_pose) is ignored silently; a call that does not exist fails when it is
-    reached.
+    A typo on a builder (inital_pose) is ignored silently; a call of a method that does not exist fails only
+    when its line runs.
 
     ## Why
     Python sets any attribute on a builder: `builder.inital_pose = ...` raises nothing, and the body is built
-    at the origin, in all 4096 envs, inside whatever stands there. A call of a method that does not exist
+    at the origin, in all 4096 envs, inside the bodies that are there. A call of a method that does not exist
     fails only when its line runs, perhaps after hours, in a branch that seldom runs.
 
     ## Mend

@@ -1,4 +1,4 @@
-"""Checks of the observation in visual modes: what a policy from pictures is told besides the pictures."""
+"""Checks of the observation in visual modes: the numbers that a policy gets besides the pictures."""
 
 from __future__ import annotations
 
@@ -35,13 +35,14 @@ MAX_BODIES = 40
 
 @rule("ground-truth", "warn", "_get_obs_extra")
 def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
-    """In visual modes _get_obs_extra leaves out the state of objects (if self.obs_mode_struct.use_state).
+    """In visual modes _get_obs_extra adds the state of objects only if self.obs_mode_struct.use_state.
 
-    A policy from pictures is told what it should see, and cannot run on a real robot.
+    The policy reads the poses of objects instead of finding them in the pictures, and cannot run on a real
+    robot.
 
     ## Why
-    A policy from pictures that is told where the objects are never learns to look. It seems to work, and
-    cannot run on a real robot, which has no such numbers.
+    A policy that reads the poses of objects never learns to find the objects in the pictures. The policy
+    seems to work, but cannot run on a real robot, which has no such numbers.
 
     ## Mend
     Add the state of objects only if the mode has state.
@@ -62,20 +63,20 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     *not applicable* for a task that has no observation mode with pictures, or in which nothing but the robot
     moves freely.
     """
-    told: dict[str, list[str]] = {}
+    bodies_of: dict[str, list[str]] = {}
     seen = {body: moved for body, moved in checkup.look(followers).items() if not moved.hidden}
     if not seen:
         raise NotApplicable("nothing but the robot moves freely")
     for body, moved in seen.items():
         for leaf in moved.observation:
-            told.setdefault(leaf, []).append(body)
-    for leaf, bodies in told.items():
+            bodies_of.setdefault(leaf, []).append(body)
+    for leaf, bodies in bodies_of.items():
         yield Found(
-            f"In obs_mode {checkup.pictured.env.obs_mode!r}, which has pictures, {leaf!r} of _get_obs_extra() tells where "
-            f"{listed(bodies)} is. Put it behind `if self.obs_mode_struct.use_state:`.",
+            f"In obs_mode {checkup.pictured.env.obs_mode!r}, which has pictures, {leaf!r} of _get_obs_extra() depends "
+            f"on the pose of {listed(bodies)}. Add the entry only `if self.obs_mode_struct.use_state:`.",
             place_of_leaf(checkup, f"extra/{leaf}"),
         )
-    if not told:
+    if not bodies_of:
         _require_all_moved(checkup)
 
 

@@ -60,7 +60,7 @@ def why_not_hidden(thing: Any) -> str:
     if thing.px_body_type == "static":
         return "it is static. Build it with build_kinematic()"
     return (
-        "it has collision shapes. Hide an actor that consists of visuals only"
+        "it has collision shapes. Hide an actor that has visual shapes only"
         if thing.has_collision_shapes
         else ""
     )

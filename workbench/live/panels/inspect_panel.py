@@ -222,7 +222,14 @@ class InspectPanel(PagePart[SessionView]):
         self._found = ""
         """Text that the names of listed bodies contain."""
         self._find = Field(
-            server, "Find", FindBodies, "text", "", hint="A part of a body's name.", live=True, longest=100
+            server,
+            "Find",
+            FindBodies,
+            "text",
+            "",
+            hint="List only bodies whose name contains this text.",
+            live=True,
+            longest=100,
         )
         self._handle = server.gui.add_html("")
         self._now: Inspection | None = None
