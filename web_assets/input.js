@@ -254,11 +254,11 @@
   let keyList = null; // the list of keys to show
 
   function readKeys() {
-    const told = [...document.querySelectorAll("[data-keys]")].at(-1);
-    if (!told) return;
-    keyList = told;
-    keys = JSON.parse(told.dataset.keys);
-    always = told.dataset.contexts.split(" ");
+    const shown = [...document.querySelectorAll("[data-keys]")].at(-1);
+    if (!shown) return;
+    keyList = shown;
+    keys = JSON.parse(shown.dataset.keys);
+    always = shown.dataset.contexts.split(" ");
   }
 
   // CapsLock changes `key`, and a Cyrillic layout has no "s": use the letter of the physical key.
@@ -558,9 +558,9 @@
   }
 
   function offer(select, options) {
-    const told = JSON.stringify(options);
-    if (select.dataset.options === told) return;
-    select.dataset.options = told;
+    const encoded = JSON.stringify(options);
+    if (select.dataset.options === encoded) return;
+    select.dataset.options = encoded;
     select.replaceChildren(...options.map(([shown, value]) => new Option(shown, value)));
   }
 

@@ -2,7 +2,7 @@
 // which reports its open tab; folds that the server and the keyboard can open; palette commands that open an address.
 //
 //   data-which="3f2a"      id of the page's content: when the user returns to it, its last open tab is restored
-//                          (with data-anew: its first tab)
+//                          (with data-first-tab: its first tab)
 //     data-says              report the open tab to the server
 //   data-open-tab="Reward" open this tab, and in it the fold data-open-fold; the keys 1 to 9 open the tabs of the panel
 //                          with data-which
@@ -19,7 +19,7 @@
 
   let which = "";
   let wanted = null; // { name, until }: the tab to restore
-  let told = { mark: null, name: "" };
+  let reported = { mark: null, name: "" };
 
   const nameOf = (tab) => tab.textContent.trim().replace(/ \d+$/, ""); // without the number of findings
   const marker = () => document.querySelector("[data-which]");
@@ -84,7 +84,7 @@
     const tabs = tabsOf(mark);
     if (mark && mark.dataset.which !== which) {
       which = mark.dataset.which;
-      if ("anew" in mark.dataset) sessionStorage.removeItem(KEEPS + which);
+      if ("firstTab" in mark.dataset) sessionStorage.removeItem(KEEPS + which);
       wanted = { name: sessionStorage.getItem(KEEPS + which), until: performance.now() + COMES };
     }
     const again = wanted && tabs.find((tab) => nameOf(tab) === wanted.name);
@@ -92,9 +92,9 @@
     if (again && performance.now() > wanted.until) wanted = null;
     else if (again && !isOpen(again)) press(again);
     const open = mark && "says" in mark.dataset && tabs.find(isOpen);
-    if (!open || (told.mark === mark && told.name === nameOf(open))) return;
-    told = { mark, name: nameOf(open) };
-    wb.ask(["tell_open_tab", { tab: told.name }]);
+    if (!open || (reported.mark === mark && reported.name === nameOf(open))) return;
+    reported = { mark, name: nameOf(open) };
+    wb.ask(["tell_open_tab", { tab: reported.name }]);
   }
 
   // --- folds: a fold is a sheet within a bordered sheet, with an arrow after its label; it reacts to clicks, not to keys ----

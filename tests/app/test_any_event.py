@@ -81,7 +81,7 @@ EVENTS = st.one_of(
     st.builds(checks.CheckFailed, why, problems),
     st.just(profile.StepTimed(PROFILE)),
     st.builds(profile.ProfileFailed, why, problems),
-    st.builds(solve_seeds.SeedsTold, why, st.none() | st.floats(0, 256), st.sampled_from([None, REPORT])),
+    st.builds(solve_seeds.SeedsUpdate, why, st.none() | st.floats(0, 256), st.sampled_from([None, REPORT])),
     st.just(solve_seeds.SeedsDone()),
     st.builds(solve_seeds.SeedsFailed, why, problems),
     st.just(solver.RolloutsStart()),

@@ -66,7 +66,7 @@ class Desk:
         self.opened.append(task)
         return self.other
 
-    def _show(self, which: Which, anew: bool = False) -> Future[None]:
+    def _show(self, which: Which, rebuild: bool = False) -> Future[None]:
         self.shown.append(which)
         return Future()
 

@@ -94,7 +94,7 @@ def pulled(session: Session, k: int) -> float:
 
 
 def driven(session: Session, k: int) -> float:
-    wait(session, lambda view: view.told is not None and not view.told[ENV, :6].any())
+    wait(session, lambda view: view.slider_action is not None and not view.slider_action[ENV, :6].any())
     time.sleep(0.4)  # the arm comes to rest
     before = joints_in(session.view()).copy()
     session.happen(Driven(("e" if k % 2 else "q",), 0.0))

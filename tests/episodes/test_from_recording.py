@@ -18,7 +18,7 @@ from workbench.app.session import Session
 from workbench.envs.recorded_run import RecordedRun
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.recorded_source import CannotEnterRecording, options_of, recorded_source, reference_of
-from workbench.live.events import ActionTold
+from workbench.live.events import SlidersMoved
 from workbench.live.timeline_commands import UndoReset
 from workbench.live.view import SessionView
 from workbench.task.description import TaskOptions
@@ -55,7 +55,7 @@ def into(session: Session, run: RecordedRun, everywhere: bool = False) -> Sessio
 
 
 def step_with(session: Session, action: np.ndarray) -> SessionView:
-    session.happen(ActionTold(tuple(range(len(action))), tuple(float(x) for x in action)))
+    session.happen(SlidersMoved(tuple(range(len(action))), tuple(float(x) for x in action)))
     return step(session)
 
 

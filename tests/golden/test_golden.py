@@ -24,7 +24,7 @@ from workbench.episodes.recorded_source import run_of
 from workbench.episodes.row import UnreadableRecording
 from workbench.library.folder import Library
 from workbench.live.commands import Step
-from workbench.live.events import ActionTold
+from workbench.live.events import SlidersMoved
 
 # Recordings are read, recovered and entered in child processes; one is recorded in this process, which needs a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")
@@ -225,7 +225,7 @@ def assert_continues_as_recorded(session: Session, path: Path, state: int) -> No
     for t in range(state, episode.length):
         last = view.timeline.last
         action = tuple(float(x) for x in episode.action[t])
-        session.happen(ActionTold(tuple(range(len(action))), action))
+        session.happen(SlidersMoved(tuple(range(len(action))), action))
         session.do(Step())
         view = wait_until(session, lambda v, last=last: v.timeline.last > last, "a step")
         assert_close(view.step.poses[1], episode.poses[t + 1])

@@ -134,9 +134,15 @@ def test_a_held_key_moves_the_robot_until_it_is_released_or_the_page_is_silent(s
         wait_until(session, lambda v, last=last: v.step_serial > last + 2, "steps")
     view = wait_until(session, lambda v: not v.of(Hands).keys, "the keys count as released")
     assert hand(session)[1, 0] > began[0] + 0.03
-    wait_until(session, lambda v: v.told is not None and not v.told[1, :6].any(), "the robot holds still")
+    wait_until(
+        session,
+        lambda v: v.slider_action is not None and not v.slider_action[1, :6].any(),
+        "the robot holds still",
+    )
     session.happen(Driven(("g",), 0))
-    wait_until(session, lambda v: v.told is not None and v.told[1, 6] == -1, "the gripper closes")
+    wait_until(
+        session, lambda v: v.slider_action is not None and v.slider_action[1, 6] == -1, "the gripper closes"
+    )
     session.happen(Driven((), 0))
     session.do(ToggleDriving())
     view = session.view()

@@ -14,7 +14,7 @@ from tests.drive.session import jump, live_session, moment_at, start_over, step
 from workbench.app.session import Session
 from workbench.hands.state import BodyMoved, BodyPulled
 from workbench.live.commands import PauseRun, PlayRun
-from workbench.live.events import ActionTold, MomentShown
+from workbench.live.events import MomentShown, SlidersMoved
 from workbench.live.history.moments import BY_HAND
 from workbench.live.messages import PullBody
 from workbench.live.timeline_commands import ContinueFromHere, UndoReset
@@ -35,7 +35,7 @@ def fresh(session: Session) -> int:
     """Pause at the first moment of seed 0's episodes; return the moment's serial."""
     session.do(PauseRun())
     session.change(episode_end="continue", action_source="sliders", selected_env=1)
-    session.happen(ActionTold(tuple(range(8)), STILL))
+    session.happen(SlidersMoved(tuple(range(8)), STILL))
     return start_over(session, 0).timeline.last
 
 

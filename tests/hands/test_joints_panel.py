@@ -113,7 +113,9 @@ def test_while_it_plays_only_what_the_control_mode_drives_can_be_moved(live_page
     assert run.field("base").off and not run.field("lift").off
     assert "choose pd_joint_pos under Control" in run.html("takes no positions for the disabled joints")
     sliders = replace(playing.settings, action_source="sliders")
-    live_page.show(replace(playing, settings=sliders, told=np.array([[0, 0], [0, -0.5], [0, 0]], np.float32)))
+    live_page.show(
+        replace(playing, settings=sliders, slider_action=np.array([[0, 0], [0, -0.5], [0, 0]], np.float32))
+    )
     assert run.field("lift").value == 0.0, "the slider shows the target"
 
 

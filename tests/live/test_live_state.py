@@ -40,7 +40,7 @@ from workbench.live.messages import (
 from workbench.live.process.supervisor import End
 from workbench.live.run import Run
 from workbench.page.command import Refused
-from workbench.rescore.state import RescoreView, RescoringTold
+from workbench.rescore.state import RescoreView, RescoringUpdate
 from workbench.task.description import TaskOptions
 from workbench.task.reference import RecordedTask
 
@@ -100,8 +100,8 @@ def test_a_new_scene_starts_a_new_past_and_shows_nothing_of_the_old_one(played: 
     session.change(selected_env=2, cameras=(EYE,))
     played.load("patched", source_hash="b")
     assert played.view.of(RescoreView).state == "loading" and played.view.of(RescoreView).total == 3
-    session.happen(RescoringTold(1, RescoreView("rescoring", done=3)))
-    session.happen(RescoringTold(1, RescoreView("done", done=3)))
+    session.happen(RescoringUpdate(1, RescoreView("rescoring", done=3)))
+    session.happen(RescoringUpdate(1, RescoreView("done", done=3)))
     assert (played.view.of(RescoreView).state, played.view.of(RescoreView).done) == ("done", 3)
     session.happen(MomentShown(1))
     session.happen(MomentShown(None))
@@ -111,7 +111,7 @@ def test_a_new_scene_starts_a_new_past_and_shows_nothing_of_the_old_one(played: 
     before = played.view
     assert (
         before.pictures
-        and before.told is told
+        and before.slider_action is told
         and before.inspection
         and before.rules
         and before.failed_cameras
@@ -121,7 +121,7 @@ def test_a_new_scene_starts_a_new_past_and_shows_nothing_of_the_old_one(played: 
     after = played.view
     assert (after.scene_serial, after.cameras_serial) == (before.scene_serial + 1, before.cameras_serial + 1)
     assert after.pictures_serial > before.pictures_serial and after.rules_serial > before.rules_serial
-    assert (after.pictures, after.told, after.inspection, after.rules) == ({}, None, None, None)
+    assert (after.pictures, after.slider_action, after.inspection, after.rules) == ({}, None, None, None)
     assert after.of(RescoreView).state == "none" and after.of(RescoreView).total == 0
     assert not after.failed_cameras and after.selected_env == 1 and after.timeline_cleared
     assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.timeline.last_tick == 0

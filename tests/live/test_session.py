@@ -23,7 +23,7 @@ from tests.drive.session import (
 )
 from workbench.app.session import Session
 from workbench.live.commands import PauseRun, PlayRun, Step
-from workbench.live.events import ActionTold, EnvsReset, PagesCounted
+from workbench.live.events import EnvsReset, PagesCounted, SlidersMoved
 from workbench.live.messages import CameraRequest, EnterRecording
 from workbench.live.view import SessionView
 
@@ -86,8 +86,10 @@ def test_a_slider_moves_one_joint_of_one_env_from_its_current_targets(
             "not the middle of the limits"
         )
         assert np.allclose(step(session, 3).step.action, start), "untouched, each joint keeps its target"
-        session.happen(ActionTold((0,), (5.0,), (1,)))
-        moved = wait_until(session, lambda v: v.told[1, 0] != start[1, 0], "the slider").told
+        session.happen(SlidersMoved((0,), (5.0,), (1,)))
+        moved = wait_until(
+            session, lambda v: v.slider_action[1, 0] != start[1, 0], "the slider"
+        ).slider_action
         others = np.ones(moved.shape, bool)
         others[1, 0] = False
         assert moved[1, 0] == pytest.approx(session.view().task.actions[0].high)
@@ -96,10 +98,12 @@ def test_a_slider_moves_one_joint_of_one_env_from_its_current_targets(
         session.change(action_source="random")
         acted = step(session).step.action
         session.change(action_source="sliders")
-        assert np.allclose(slider_values(session, lambda v: not np.array_equal(v.told, moved)), acted)
+        assert np.allclose(
+            slider_values(session, lambda v: not np.array_equal(v.slider_action, moved)), acted
+        )
         session.happen(EnvsReset((0,)))
         after = slider_values(
-            session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.told, acted)
+            session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.slider_action, acted)
         )
         assert np.allclose(after[0, :7], session.view().step.qpos[0, :7], atol=1e-5)
         assert np.allclose(after[1], acted[1]), "env 1 was not reset"
@@ -107,9 +111,11 @@ def test_a_slider_moves_one_joint_of_one_env_from_its_current_targets(
 
 def slider_values(session: Session, reached: Callable[[SessionView], bool] = lambda view: True) -> np.ndarray:
     """(N, A) values of the sliders."""
-    view = wait_until(session, lambda v: v.told is not None and reached(v), "what the robots are told")
-    assert view.told is not None
-    return view.told
+    view = wait_until(
+        session, lambda v: v.slider_action is not None and reached(v), "what the robots are told"
+    )
+    assert view.slider_action is not None
+    return view.slider_action
 
 
 def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, tmp_path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from tests.drive.session import draw_past, jump, live_session, moment_at, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.live.commands import PauseRun, RestartWorker
-from workbench.live.events import ActionTold, EnvsReset, MomentShown, PagesCounted
+from workbench.live.events import EnvsReset, MomentShown, PagesCounted, SlidersMoved
 from workbench.live.messages import CameraRequest
 from workbench.live.timeline_commands import ContinueFromHere, UndoReset
 from workbench.record.commands import StopRecording
@@ -33,7 +33,7 @@ def fresh(session: Session) -> int:
     session.do(PauseRun())
     session.change(episode_end="reset")
     session.change(action_source="sliders")
-    session.happen(ActionTold(tuple(range(8)), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
+    session.happen(SlidersMoved(tuple(range(8)), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
     return start_over(session, 0).timeline.last
 
 

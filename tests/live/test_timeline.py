@@ -114,7 +114,7 @@ def test_a_moment_is_pinned_until_the_view_returns_to_live(played: FakeWorkerSes
     played.step()
     view = played.view
     assert (view.timeline.shown, at(played), view.timeline.last) == (1, 1, 4), "new steps do not move it"
-    assert view.told is view.step.action and view.timeline.can_continue
+    assert view.slider_action is view.step.action and view.timeline.can_continue
     assert (view.timeline.tick, view.timeline.steps, view.timeline.steps_ago) == (1, 4, 3)
     seek(session, -5)
     assert at(played) == 0

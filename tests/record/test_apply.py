@@ -68,7 +68,7 @@ from workbench.record.state import (
     TakeStep,
 )
 from workbench.rescore import state as of_rescoring
-from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringTold
+from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringUpdate
 from workbench.solve.state import RunningEpisode, Solving
 from workbench.task.description import TaskOptions
 
@@ -127,7 +127,7 @@ EVENTS = st.one_of(
     st.builds(EpisodesSaved, numbers, st.text(max_size=5)),
     st.builds(SaveFailed, numbers, st.text(max_size=5)),
     st.builds(
-        RescoringTold,
+        RescoringUpdate,
         numbers,
         st.builds(RescoreView, st.sampled_from(["loading", "rescoring", "done", "failed"]), done=numbers),
     ),
@@ -250,7 +250,7 @@ def test_late_events_of_an_older_recording_or_job_change_only_the_waiting_bytes(
     assert effects == [] and changed.recording == replace(state.recording, waiting_bytes=-10)
     state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
     assert [type(effect) for effect in effects] == [BeginSaving]
-    late = RescoringTold(1, RescoreView("done"))
+    late = RescoringUpdate(1, RescoreView("done"))
     for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), late):
         assert apply_filtered(state, event) == (state, [])
     state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))

@@ -37,12 +37,12 @@ def recorded(file: Path | None, task: str = "Push-v1") -> EpisodeInfo:
 def test_the_file_that_a_recording_names_is_named(file: Path) -> None:
     todays, text = codes_for([recorded(file)], [file])
     assert (todays.label, text.label) == (TODAYS, RECORDED)
-    assert f"{file}" in todays.told and todays.file is None and text.recorded
+    assert f"{file}" in todays.source_text and todays.file is None and text.recorded
     held = source_hash({file.name: file.read_text()}, Path())
-    assert f"(version {held})" in text.told, (
+    assert f"(version {held})" in text.source_text, (
         "the version is that of the held text, whatever the recording claims"
     )
-    assert "Push-v1 as a package registers it" in codes_for([recorded(None)], [])[0].told
+    assert "Push-v1 as a package registers it" in codes_for([recorded(None)], [])[0].source_text
 
 
 def test_a_copy_with_that_task_is_a_choice_and_other_files_are_not(file: Path, tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_a_copy_with_that_task_is_a_choice_and_other_files_are_not(file: Path, t
     other.write_text(TASK.replace("Push", "Pull"))
     found = codes_for([recorded(file)], [file, copy, other, tmp_path / "gone.py"])
     assert [(code.label, code.file) for code in found[2:]] == [("push.py", copy)]
-    assert str(copy) in found[2].told
+    assert str(copy) in found[2].source_text
 
 
 def test_for_unopened_recordings_every_known_file_is_a_choice(file: Path) -> None:

@@ -10,10 +10,10 @@ from workbench.live.effects import Asked
 from workbench.live.process.background_jobs import StoppedBy
 from workbench.live.timeline_commands import StopRescoring
 from workbench.page.command import Refused
-from workbench.rescore.state import EndRescoring, RescoreView, Rescoring, RescoringTold, apply_to_job
+from workbench.rescore.state import EndRescoring, RescoreView, Rescoring, RescoringUpdate, apply_to_job
 
 BEGUN = Rescoring().begun(RescoreView("loading", total=2, unit="episodes"))
-HALF = RescoringTold(BEGUN.job, replace(BEGUN.view, state="rescoring", done=1))
+HALF = RescoringUpdate(BEGUN.job, replace(BEGUN.view, state="rescoring", done=1))
 
 
 def test_a_stopped_rescoring_keeps_its_results_and_ignores_late_reports() -> None:
@@ -22,7 +22,7 @@ def test_a_stopped_rescoring_keeps_its_results_and_ignores_late_reports() -> Non
     stopped, effects = apply_to_job(half, Asked(StopRescoring()))
     assert effects == [EndRescoring()] and stopped.view.serial > half.view.serial
     assert (stopped.view.state, stopped.view.stopped_by, stopped.view.done) == ("stopped", StoppedBy.HAND, 1)
-    late = RescoringTold(BEGUN.job, replace(HALF.view, state="done", done=2))
+    late = RescoringUpdate(BEGUN.job, replace(HALF.view, state="done", done=2))
     assert apply_to_job(stopped, late) == (stopped, [])
     with pytest.raises(Refused):
         apply_to_job(stopped, Asked(StopRescoring()))

@@ -55,7 +55,7 @@ from workbench.review.state import (
     RecordingRead,
     ReviewEvent,
     ReviewState,
-    SceneTold,
+    SceneUpdate,
     apply,
 )
 from workbench.review.view import Opened, ReviewView, find_events
@@ -94,7 +94,7 @@ def read(id: str, late: int, scene: bool) -> Happens:
 
 def scene(id: str, late: int, there: bool) -> Happens:
     episode = EPISODES[id] if there else None
-    return lambda state: SceneTold(state.opening.number - late, id, "made", not there, episode)
+    return lambda state: SceneUpdate(state.opening.number - late, id, "made", not there, episode)
 
 
 def read_next(late: int, scene: bool) -> Happens:

@@ -188,7 +188,7 @@ class Page:
         # A hash, since the path may be long.
         which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
         self._open_tabs = OpenTabs(visitors)
-        server.gui.add_html(render("which", which=which, anew=False, says=True))
+        server.gui.add_html(render("which", which=which, first_tab=False, says=True))
         self._opening = None if chooser is None else OpenDialog(server, chooser)
         with add_bar(server):
             name = str(session.reference) if file is None else file.name
@@ -380,7 +380,7 @@ class Page:
             case TellUnfolded(panel=panel):
                 self._unfolded(panel)
             case TellDrawnInSoftware():
-                self._in_software.told_by(visitor)
+                self._in_software.drawn_by_visitor(visitor)
             case ToggleTable():
                 self._toggle_envs()
             case ToggleTimeline():

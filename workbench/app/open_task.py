@@ -183,7 +183,7 @@ class OpenTask:
         shared.session = shared.home = session
         self._open_reference = entry.lasting
         # Until the new page is shown, the old page draws the old session.
-        shown = asyncio.wrap_future(shared.pages.show("live", anew=True))
+        shown = asyncio.wrap_future(shared.pages.show("live", rebuild=True))
         await asyncio.wait([shown], timeout=_SHOW_TIMEOUT_SECONDS)
         if old is not None:
             self._doing = "Closing the previous task: writing its recordings …"

@@ -73,7 +73,7 @@ class ShownPage(Protocol):
 @dataclass(frozen=True)
 class _PageRequest:
     which: Which
-    anew: bool
+    rebuild: bool
     shown: Future[None] = field(default_factory=Future)
 
 
@@ -104,7 +104,7 @@ class Pages:
         """Name of the page that is shown; None while a page is being built."""
         self._page: ShownPage | None = None
         self._dark = True
-        self._told = RateLimitedLog()
+        self._events_log = RateLimitedLog()
         self._thread = watched_thread("pages", self._run)
 
     def start(self, which: Which) -> None:
@@ -113,13 +113,13 @@ class Pages:
         self._thread.start()
         shown.result()
 
-    def show(self, which: Which, anew: bool = False) -> Future[None]:
+    def show(self, which: Which, rebuild: bool = False) -> Future[None]:
         """Request a page. The future is done when this page, or one that was requested later, is shown.
 
         Args:
-            anew: rebuild the page even if it is shown, because its session was replaced.
+            rebuild: build the page again even if it is shown, because its session was replaced.
         """
-        request = _PageRequest(which, anew)
+        request = _PageRequest(which, rebuild)
         self._wishes.put(request)
         return request.shown
 
@@ -175,7 +175,7 @@ class Pages:
             wishes.append(self._wishes.get())
         which = wishes[-1].which
         try:
-            if which != self.shown or any(wish.anew for wish in wishes if wish.which == which):
+            if which != self.shown or any(wish.rebuild for wish in wishes if wish.which == which):
                 self._build(which)
         except Exception as error:
             # The thread must survive, or no button could show a page again.
@@ -214,7 +214,7 @@ class Pages:
                 page.redraw()
         except Exception as error:
             # Drawing is retried every second, so the log limits the number of tracebacks.
-            self._told.happened(type(error), "The page could not be drawn; trying again.", error)
+            self._events_log.add(type(error), "The page could not be drawn; trying again.", error)
             tell_all(
                 self._server,
                 "This page could not be drawn",

@@ -122,7 +122,7 @@ class ReviewPage:
         tools: Objects that outlive the page.
         also: Further commands that all pages have.
         dark: Whether the first theme is dark.
-        anew: Show the first tab, even in a browser that left the page on another tab.
+        first_tab: Show the first tab, even in a browser that left the page on another tab.
         clock: Clock of all parts of the page.
     """
 
@@ -133,7 +133,7 @@ class ReviewPage:
         tools: ReviewTools,
         also: frozenset[type[Command]],
         dark: bool = True,
-        anew: bool = False,
+        first_tab: bool = False,
         clock: Clock = time.monotonic,
     ) -> None:
         self._shared, self._tools, self._clock = shared, tools, clock
@@ -149,7 +149,7 @@ class ReviewPage:
         self._unfolded = "", 0.0
         """(name of the panel that was unfolded last, time of the unfolding); ("", 0) once the width of the
         view has been checked."""
-        self._told = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
+        self._panels_due = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
@@ -162,7 +162,7 @@ class ReviewPage:
             self._status = server.gui.add_html("")
             server.gui.add_html(render("help_link"))
         self._open_tabs = OpenTabs(shared.visitors)
-        server.gui.add_html(render("which", which="review", anew=anew, says=False))
+        server.gui.add_html(render("which", which="review", first_tab=first_tab, says=False))
         shared.stage.in_software.ask()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review)
@@ -306,7 +306,7 @@ class ReviewPage:
 
     def _draw_panels(self, view: ReviewView) -> None:
         """Draw all panels from one view; while a recording plays, less often than the 3-D view."""
-        if not self._told.is_due(object(), urgent=None if view.playing else object()):
+        if not self._panels_due.is_due(object(), urgent=None if view.playing else object()):
             return
         self._add_late_sweep()
         self._make_way_for_the_first(view)
@@ -436,7 +436,7 @@ class ReviewPage:
             case TellUnfolded(panel=panel):
                 self._panel_unfolded(panel)
             case TellDrawnInSoftware():
-                self._shared.stage.in_software.told_by(visitor)
+                self._shared.stage.in_software.drawn_by_visitor(visitor)
             case ToggleTable():
                 self._show_library(not self._library_open)
             case ToggleTimeline():

@@ -110,8 +110,8 @@ class App:
             return StartPage(shared, self.open_task, self.does, dark)
         if which == "review":
             shared.recordings.library.request_scan()
-            anew, shared.looks_at = shared.looks_at, False
-            return ReviewPage(shared, self.open_task, self.review_tools, self.does, dark, anew)
+            first_tab, shared.looks_at = shared.looks_at, False
+            return ReviewPage(shared, self.open_task, self.review_tools, self.does, dark, first_tab)
         # Imported late: a review alone does not need it.
         from workbench.app.live_page import Page
 

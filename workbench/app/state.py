@@ -31,7 +31,7 @@ SessionEvent = (
     | of_recording.RecordEvent
     | SaveWanted
     | SaveEvent
-    | of_rescoring.RescoringTold
+    | of_rescoring.RescoringUpdate
     | of_checks.CheckEvent
     | of_profile.ProfileEvent
     | of_seeds.SeedsEvent

@@ -29,7 +29,7 @@ from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.machine.loop import post
 from workbench.page.scene.env_grid import line_set
 from workbench.page.scene.viewpoint import DEFAULT_ASPECT
-from workbench.page.widgets.notices import refusals_told
+from workbench.page.widgets.notices import refusals_shown
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, target_of, vertical_fov
 
 RELEASE_TIMEOUT_SECONDS = 60.0
@@ -169,7 +169,7 @@ class CameraGizmo:
         if start is None:
             return
         pose, own = start.pose, self._own_axes()
-        with refusals_told(client, then=self._let_go):
+        with refusals_shown(client, then=self._let_go):
             moved = there if own else turned_in_world(pose, there[:3], there[3:])
             moved = snapped(pose, moved, self._snap(), own, start.frame.offset)
             self._place(start, moved, start.target - pose[:3])
@@ -186,7 +186,7 @@ class CameraGizmo:
         at = np.concatenate([before, UNTURNED]), np.concatenate([point, UNTURNED])
         there = snapped(*at, Snap(metres=self._snap().metres), False, start.frame.offset)[:3]
         eye, target = (there, target) if moves_eye else (pose[:3], there)
-        with refusals_told(client, then=self._let_go):
+        with refusals_shown(client, then=self._let_go):
             self._place(start, looking_at(pose, eye, target), target - eye)
 
     def _place(self, start: _Taken, pose: Floats, sight: Floats) -> None:

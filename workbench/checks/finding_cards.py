@@ -130,12 +130,12 @@ def summary(checks: ChecksView, shown: list[Card]) -> str:
             by_degree[row.finding.degree] += not row.old
     states = counts(without_finding(checks, shown))
     old = sum(row.old for card in shown for row in card.rows)
-    told = (
+    counted = (
         *((by_degree[degree], degree) for degree in DEGREES),
         *((states[state], state_text(state)) for state in _SUMMED),
         (old, "of the version before"),
     )
-    return ", ".join(f"{number} {what}" for number, what in told if number)
+    return ", ".join(f"{number} {what}" for number, what in counted if number)
 
 
 def times(count: int) -> str:

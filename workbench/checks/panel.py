@@ -107,7 +107,7 @@ def findings_mark(view: SessionView) -> FindingsMark | None:
 
 def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) -> str:
     """HTML of the progress and the result of the checks."""
-    return render("checks_status", checks=checks, told=summary(checks, found), link=link)
+    return render("checks_status", checks=checks, summary=summary(checks, found), link=link)
 
 
 def _comments(view: SessionView) -> list[Comment]:
@@ -148,14 +148,14 @@ def list_html(
     rest = without_finding(checks, found)
     failed = [result for result in rest if result.state == "failed"]
     kept = [result.rule for result in rest if result.state == "kept"]
-    told = [result for result in rest if result.silenced or result.notes]
+    noted = [result for result in rest if result.silenced or result.notes]
     return render(
         "finding_cards",
         **known,
         rest=len(rest) - len(failed),
         failed=failed,
         undecided=undecided(rest),
-        told=told,
+        noted=noted,
         kept=kept,
         comments=comments,
         REST=REST,

@@ -70,7 +70,7 @@ class JointsPanel(PagePart[SessionView]):
         shown = view.step_serial, view.task_serial, view.selected_env, view.timeline.shown, view.playing
         hands = view.of(Hands)
         moves = hands.dragged, hands.all_envs
-        return shown, view.settings.action_source, id(view.told), moves, self._unfolded
+        return shown, view.settings.action_source, id(view.slider_action), moves, self._unfolded
 
     def urgent(self, view: SessionView) -> object:
         return view.of(Hands).dragged, view.task_serial, view.playing, self._unfolded
@@ -187,8 +187,8 @@ def shown_position(view: SessionView, robot: RobotDescription, number: int) -> f
         if env in dragged.env_idx:
             return dragged.position
     is_driven = view.playing and view.settings.action_source == "sliders"
-    if is_driven and target is not None and view.told is not None and env < len(view.told):
-        return float(view.told[env, target.dimension]) / target.scale + target.zero
+    if is_driven and target is not None and view.slider_action is not None and env < len(view.slider_action):
+        return float(view.slider_action[env, target.dimension]) / target.scale + target.zero
     return float(qpos[env, joint.column])
 
 

@@ -75,7 +75,7 @@ class LedArms:
         if request is None or (arm := _arm(task.env, request)) is None:
             return
         goal = solve(arm, request.env, np.asarray(request.pose, np.float64))
-        self._send(_told(task.env, arm, request, goal, with_links=True))
+        self._send(_reached(task.env, arm, request, goal, with_links=True))
 
     def lead(self, task: TaskEnv, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """The action (N, A) with the numbers of the led arms set; `action` itself is not changed."""
@@ -93,13 +93,13 @@ class LedArms:
                 moves = steer(task.env, arm, request.env, goal, action[request.env])
                 is_new, target = target.goal is None, _Target(request, goal, base)
                 self._targets[key] = target
-                told = _told(task.env, arm, request, goal)
+                reached = _reached(task.env, arm, request, goal)
                 if not moves:
-                    told = replace(
-                        told, why=f"the control mode {task.env.control_mode} does not move this arm"
+                    reached = replace(
+                        reached, why=f"the control mode {task.env.control_mode} does not move this arm"
                     )
-                if is_new or told.why:
-                    self._send(told)
+                if is_new or reached.why:
+                    self._send(reached)
             elif target.goal is not None:
                 steer(task.env, arm, request.env, target.goal, action[request.env])
         return action
@@ -115,9 +115,9 @@ def set_arm(task: TaskEnv, request: ReachPose) -> tuple[StepResult, Restored, Re
     agent = next(agent for agent in maniskill_private.agents(env) if agent.robot is arm.articulation)
     qpos = torch.as_tensor(goal.qpos, dtype=torch.float32, device=env.device)[None]
     step = put_joints(task, agent, [of], qpos)
-    told = _told(env, arm, request, goal)
+    reached = _reached(env, arm, request, goal)
     how = f"{request.arm} was moved by hand."
-    return step, Restored((of,), (of,), request.origin, None, {}, how=how, moved=request.arm), told
+    return step, Restored((of,), (of,), request.origin, None, {}, how=how, moved=request.arm), reached
 
 
 def _arm(env: Any, request: ReachPose) -> Arm | None:
@@ -133,7 +133,7 @@ def _base(arm: Arm, env: int) -> NDArray[np.float64]:
     return np.concatenate([root, np.delete(arm.qpos(env), list(arm.joints))])
 
 
-def _told(env: Any, arm: Arm, request: ReachPose, goal: ArmPose, with_links: bool = False) -> Reached:
+def _reached(env: Any, arm: Arm, request: ReachPose, goal: ArmPose, with_links: bool = False) -> Reached:
     links, poses = (), np.zeros((0, 7), np.float32)
     if with_links:
         row, index = arm.row(request.env), scene_index(env)

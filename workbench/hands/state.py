@@ -262,17 +262,17 @@ def _drive(
         grips = gripper(run.task.actions)
         dimensions += tuple(k for k, _, _ in grips)
         values += tuple(closed if closes else opened for _, closed, opened in grips)
-    told: list[Any] = [Send(SetSliderAction((run.env,), dimensions, values))] if dimensions else []
+    effects: list[Any] = [Send(SetSliderAction((run.env,), dimensions, values))] if dimensions else []
     if (hands.keys or hands.sticks) and hands.env != run.env:  # another env was selected while they were held
         still = driven_action(run.task.actions, (), yaw)
-        told.append(Send(SetSliderAction((hands.env,), *still)))
+        effects.append(Send(SetSliderAction((hands.env,), *still)))
     reach = hands.reach
     if any(values[: len(bindings(run.task.actions))]):  # the keys override the handles
-        told += of_reach.let_go(reach, run.env)
+        effects += of_reach.let_go(reach, run.env)
         reach = of_reach.without(reach, run.env)
     if keys or sticks:
-        told.append(Later(LET_GO_SECONDS, DrivingDue(hands.number)))
-    return replace(hands, keys=keys, sticks=sticks, env=run.env, closes=closes, reach=reach), told
+        effects.append(Later(LET_GO_SECONDS, DrivingDue(hands.number)))
+    return replace(hands, keys=keys, sticks=sticks, env=run.env, closes=closes, reach=reach), effects
 
 
 def _end_episode(
@@ -299,11 +299,11 @@ def _end_episode(
     if isinstance(episode, str):
         raise Refused(f"There is no episode to keep or discard: {episode}.")
     if isinstance(command, KeepEpisode):
-        hands, told = _keep(hands, run, episode)
+        hands, effects = _keep(hands, run, episode)
         if not has_step:  # the next episode has begun already
-            return hands, told
+            return hands, effects
         hands, more = _begin_episode(hands, env, next_seed)
-        return hands, [*told, *more]
+        return hands, [*effects, *more]
     if not has_step:
         raise Refused("There is no episode to discard: this one has no step yet.")
     hands = replace(hands, note=f"{_named(episode)} was discarded. Shift+U brings it back.")
@@ -385,9 +385,9 @@ def _drive_joint(run: Run, joint: Joint, envs: tuple[int, ...], position: float)
     dimension = run.task.actions[joint.target.dimension]
     value = joint.target.scale * (position - joint.target.zero)
     value = min(max(value, dimension.low), dimension.high)
-    told = Send(SetSliderAction(envs, (joint.target.dimension,), (value,)))
+    request = Send(SetSliderAction(envs, (joint.target.dimension,), (value,)))
     takes_over = Then(SettingsChanged({"action_source": "sliders"}))
-    return [told] if run.settings.action_source == "sliders" else [takes_over, told]
+    return [request] if run.settings.action_source == "sliders" else [takes_over, request]
 
 
 def _use_keyframe(hands: Hands, run: Run, name: str, keyframe: str) -> Send:

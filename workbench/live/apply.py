@@ -36,7 +36,6 @@ from workbench.live.commands import (
 from workbench.live.effects import Asked, Later
 from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
 from workbench.live.events import (
-    ActionTold,
     EnvEventShown,
     EnvsReset,
     EpisodeStepShown,
@@ -59,6 +58,7 @@ from workbench.live.events import (
     RunToEnter,
     Send,
     SettingsChanged,
+    SlidersMoved,
     VersionLoaded,
     WorkerBusy,
     WorkerDied,
@@ -199,7 +199,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case Placed():
             return _placed(run, event), []
         case SliderAction():
-            return replace(run, told=event.action), []
+            return replace(run, slider_action=event.action), []
         case Inspection():
             return replace(run, inspection=event), []
         case WorkerDied():
@@ -235,7 +235,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             return _show(run, None if run.kept is None else run.kept.seek_env_event(env, kind)), effects
         case PastPicturesWanted(at=at):
             return _draw_past(run) if at == run.stands_at else (run, [])
-        case ActionTold():
+        case SlidersMoved():
             if run.task is None:
                 return run, []
             envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx

@@ -153,7 +153,7 @@ class PastPicturesWanted:
 
 
 @dataclass(frozen=True)
-class ActionTold:
+class SlidersMoved:
     """Set these dimensions of the action of some envs (None: all), while the source of actions is
     ``sliders``. Without dimensions, the envs hold still."""
 
@@ -202,7 +202,7 @@ RunEvent = (
     | EpisodeStepShown
     | EnvEventShown
     | PastPicturesWanted
-    | ActionTold
+    | SlidersMoved
     | ReadingChosen
     | ReadingDue
     | EnvsReset

@@ -180,7 +180,7 @@ def _new_scene(run: Run, task: TaskDescription, first: StepResult, its_past_stay
         scene_serial=run.scene_serial + (not drawn),
         settings=replace(run.settings, selected_env=selected),
         inspection=None,
-        told=None,
+        slider_action=None,
         # The worker reports broken rules of the new scene after the load.
         rules=None,
         rules_serial=run.rules_serial + 1,

@@ -143,7 +143,7 @@ class Run:
     """Serial of the moment at which the condition held; None once the run has continued."""
     pulled: Pulled | None = None
     """The pull by hand during the newest step."""
-    told: NDArray[np.float32] | None = None
+    slider_action: NDArray[np.float32] | None = None
     """(N, A) next action of the sliders; None if unknown."""
     options_refused: TaskOptions | None = None
     """The options that were applied last, if the task failed with them; else None."""

@@ -80,7 +80,7 @@ class SessionView:
     """Serial of the moment at which the condition held; None once the run has continued."""
     pulled: Pulled | None = None
     """The pull by hand during the shown step."""
-    told: NDArray[np.float32] | None = None
+    slider_action: NDArray[np.float32] | None = None
     """(N, A) next action of the sliders; for a past moment, the action that led there. None if unknown."""
     options: TaskOptions = TaskOptions()
     """How the envs are made, apart from the seed in these options: the seed in use is `SessionView.seed`."""
@@ -162,6 +162,6 @@ def view_of(run: Run, **known: Any) -> SessionView:
         step=moment.step,
         step_serial=moment.serial,
         pictures=past.pictures(run.env),
-        told=moment.step.action,
+        slider_action=moment.step.action,
         pulled=moment.pulled,
     )

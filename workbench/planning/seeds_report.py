@@ -38,7 +38,7 @@ class SolveReport:
 
     seeds: tuple[SolvedSeed, ...]
     verdicts: tuple[RewardVerdict, ...]
-    """Verdicts over the seeds so far; empty unless there are enough seeds (`tells`). May change with more seeds."""
+    """Verdicts over the seeds so far; empty unless there are enough seeds (`has_enough_seeds`). May change with more seeds."""
     seconds: float
     """Wall time, including the opening of the task."""
     stopped: bool
@@ -56,7 +56,7 @@ class SolveReport:
         return median(one.solved_at for one in self.solved) if self.solved else None
 
     @property
-    def tells(self) -> bool:
+    def has_enough_seeds(self) -> bool:
         """Whether there are enough seeds for verdicts: the next seeds may refute what the first ones show."""
         return len(self.seeds) >= min(MIN_EPISODES, self.wanted)
 
@@ -81,7 +81,7 @@ class SolveReport:
     def notes(self) -> tuple[str, ...]:
         """Limits of the result, as sentences."""
         found = []
-        if not self.tells:
+        if not self.has_enough_seeds:
             found.append(f"Verdicts on the reward need at least {MIN_EPISODES} seeds.")
         if self.wanted < MIN_SEEDS:
             found.append(few_seeds_text(self.wanted))

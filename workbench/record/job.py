@@ -180,7 +180,7 @@ def do_record(
             file.unlink(missing_ok=True)
 
 
-class ToldByWorkers:
+class WorkerUpdates:
     """Collects the workers' progress messages, and computes the progress of the job."""
 
     def __init__(
@@ -263,7 +263,7 @@ class _Recording:
         self._out, self._folder, self._wanted = what.out, what.out.absolute(), what.successes
         self._upload = what.upload
         self._on_progress = on_progress
-        self._told = ToldByWorkers(on_activity, on_finding, on_notice)
+        self._updates = WorkerUpdates(on_activity, on_finding, on_notice)
         self._kept: dict[int, Written] = {}
         self._ended = 0
         most = what.episodes if what.successes is None else what.tries
@@ -289,7 +289,7 @@ class _Recording:
 
     def _over(self, number: int, written: Written | None) -> None:
         self._ended += 1
-        self._told.over(number)
+        self._updates.over(number)
         if written is not None:
             # Use the folder's path as the person wrote it.
             self._kept[number] = replace(written, path=self._out / written.path.name)
@@ -302,16 +302,16 @@ class _Recording:
 
     def _failed(self, failure: Failure) -> None:
         self._ended += len(failure.numbers)
-        self._told.failed(failure)
+        self._updates.failed(failure)
         self._tell()
 
     def _on_update(self, update: RecordUpdate) -> None:
-        if self._told.take(update):
+        if self._updates.take(update):
             self._tell()
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
         kept = len(self._kept)
-        self._on_progress(self._told.progress(kept, over, self.scheduler, self._wanted is None))
+        self._on_progress(self._updates.progress(kept, over, self.scheduler, self._wanted is None))
 
     def _remove(self, episode: Written) -> None:
         if self._upload:

@@ -13,7 +13,7 @@ from workbench.live.process.ask import Background
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
 from workbench.machine.loop import do
 from workbench.rescore.past_scores import RescoredPast
-from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringTold
+from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringUpdate
 from workbench.rescore.verdict import RescoredMoments, RescoreMoments
 
 _CHUNK_SECONDS = 0.1
@@ -31,7 +31,7 @@ class PastRescorer:
     hangs, the process is killed.
     """
 
-    def __init__(self, process: Background, happen: Callable[[RescoringTold], object]) -> None:
+    def __init__(self, process: Background, happen: Callable[[RescoringUpdate], object]) -> None:
         """
         Args:
             process: the background process; other jobs there have priority.
@@ -39,7 +39,7 @@ class PastRescorer:
         """
         self._process, self._happen = process, happen
         self._jobs = Jobs(lambda: None, self._failed)
-        self._told = RescoringTold(0, RescoreView())
+        self._update = RescoringUpdate(0, RescoreView())
         """State and results of the running job, or of the last one."""
         self._past: RescoredPast | None = None
 
@@ -50,7 +50,7 @@ class PastRescorer:
             self._past.release()
         match effect:
             case BeginRescoring(job=number, view=view, load=load, past=past):
-                self._told, self._past = RescoringTold(number, view), past
+                self._update, self._past = RescoringUpdate(number, view), past
                 self._jobs.start("rescoring", lambda job: self._rescore(job, load, past))
             case EndRescoring():
                 self._past = None
@@ -64,8 +64,8 @@ class PastRescorer:
 
     def _tell(self, **values: Any) -> None:
         """Update these fields of the view, and send it."""
-        self._told = replace(self._told, view=replace(self._told.view, **values))
-        self._happen(self._told)
+        self._update = replace(self._update, view=replace(self._update.view, **values))
+        self._happen(self._update)
 
     # --- the job -------------------------------------------------------------------------------------
 
@@ -84,7 +84,7 @@ class PastRescorer:
                 state="rescoring",
                 done=done,
                 steps=done,
-                seconds=self._told.view.seconds + seconds,
+                seconds=self._update.view.seconds + seconds,
                 warnings=tuple(f"not restored: {what}: {why}" for what, why in missed.items()),
                 **summary,
             )

@@ -29,7 +29,7 @@ from workbench.live.process.ask import Background
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
 from workbench.machine.loop import BlockingPool, do, on_loop
 from workbench.page.command import Command
-from workbench.rescore.state import RescoreView, Rescoring, RescoringTold, apply_to_job
+from workbench.rescore.state import RescoreView, Rescoring, RescoringUpdate, apply_to_job
 from workbench.rescore.verdict import Rescore, Rescored, Verdict
 from workbench.task.description import TaskOptions
 from workbench.task.library_names import named_like_library_text
@@ -209,7 +209,7 @@ class Rescorer:
 
     # --- on the loop ---------------------------------------------------------------------------------
 
-    def _happen(self, event: Asked | RescoringTold) -> None:
+    def _happen(self, event: Asked | RescoringUpdate) -> None:
         self._rescoring, effects = apply_to_job(self._rescoring, event)
         if effects:
             self._jobs.stop()
@@ -218,7 +218,7 @@ class Rescorer:
         """Update these fields of the view, add verdicts, and send the view."""
         known = (*self.view.verdicts, *verdicts)
         view = replace(self.view, verdicts=known, done=len(known), **values)
-        self._happen(RescoringTold(self._rescoring.job, view))
+        self._happen(RescoringUpdate(self._rescoring.job, view))
 
     def _failed(self, failure: JobFailed) -> None:
         self._tell(state="failed", why=str(failure), problem=failure.problem)

@@ -41,7 +41,7 @@ class Code:
     """A choice of the code that rescores recordings. A page sends only its label, never a path."""
 
     label: str = field(compare=False)
-    told: str = field(compare=False)
+    source_text: str = field(compare=False)
     """Text for the page. It names the files."""
     file: Path | None = None
     """File to use for the tasks in it, instead of the files named by the recordings."""
@@ -148,7 +148,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             TODAYS,
             hint="The current code of the task, the recorded code, or a task file that is open here",
         )
-        self._told = gui.add_html("")
+        self._source_text = gui.add_html("")
         self._states = tick(
             server,
             "Recorded states",
@@ -233,7 +233,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             self._codes = codes_for([one.episode.info for one in view.opened], self._known())
         chosen = self._chosen()
         self._code.show(chosen.label, options=by_name([code.label for code in self._codes]))
-        self._told.content = render("note", text=chosen.told)
+        self._source_text.content = render("note", text=chosen.source_text)
 
     def _key_of(self, verdict: Verdict[Source]) -> str:
         return verdict.of.id

@@ -95,7 +95,7 @@ class Rescoring:
 
 
 @dataclass(frozen=True)
-class RescoringTold:
+class RescoringUpdate:
     """New state and results of a job."""
 
     job: int
@@ -137,7 +137,7 @@ def apply_to_job(rescoring: Rescoring, event: object) -> Change:
             if not rescoring.running:
                 raise Refused("Nothing is being rescored.")
             return _stop(rescoring, StoppedBy.HAND)
-        case RescoringTold(job=rescoring.job, view=view) if rescoring.running:
+        case RescoringUpdate(job=rescoring.job, view=view) if rescoring.running:
             return rescoring.shows(view), []
     return rescoring, []
 

@@ -40,7 +40,7 @@ from workbench.review.state import (
     RecordingRead,
     ReviewEvent,
     ReviewState,
-    SceneTold,
+    SceneUpdate,
     advanced,
     apply,
     next_position_in,
@@ -246,7 +246,7 @@ class Review:
         """Make the scenes of recordings that contain none."""
 
         def tell(one: Opened, scene: str, making: bool = False, episode: Episode | None = None) -> None:
-            event = SceneTold(number, one.id, scene, making, episode)
+            event = SceneUpdate(number, one.id, scene, making, episode)
             post(lambda: self._happened(event))
 
         def check() -> None:

@@ -132,7 +132,7 @@ class ReadingEnded:
 
 
 @dataclass(frozen=True)
-class SceneTold:
+class SceneUpdate:
     """Result or progress of making a scene."""
 
     opening: int
@@ -171,7 +171,7 @@ ReviewEvent = (
     | RecordingRead
     | RecordingNotRead
     | ReadingEnded
-    | SceneTold
+    | SceneUpdate
     | FilesChecked
     | ProblemFound
 )
@@ -216,7 +216,7 @@ def apply(state: ReviewState, event: ReviewEvent, now: float) -> Change:
 def _applied(state: ReviewState, event: ReviewEvent, now: float) -> Change:
     opening = state.opening
     if (
-        isinstance(event, RecordingRead | RecordingNotRead | ReadingEnded | SceneTold)
+        isinstance(event, RecordingRead | RecordingNotRead | ReadingEnded | SceneUpdate)
         and event.opening != opening.number
     ):
         return state, []
@@ -246,8 +246,8 @@ def _applied(state: ReviewState, event: ReviewEvent, now: float) -> Change:
             read = tuple(sorted(opening.read, key=lambda one: one.episode.info.written_at))
             state = _show(state, read, now) if read else state
             return replace(state, opening=replace(state.opening, read=())), []
-        case SceneTold():
-            return _scene_told(state, event), []
+        case SceneUpdate():
+            return _update_scene(state, event), []
         case FilesChecked(files=files, changed=changed, task_of=task_of, changed_symbols=symbols):
             chosen = state.view.chosen
             if (
@@ -536,13 +536,13 @@ def _align(state: ReviewState, how: str, kept: int | None, now: float) -> Review
     return _moved(_with(state, align=how, anchors=anchors, first=first, last=last), at, now)
 
 
-def _scene_told(state: ReviewState, told: SceneTold) -> ReviewState:
+def _update_scene(state: ReviewState, update: SceneUpdate) -> ReviewState:
     opened = list(state.view.opened)
-    index = next((index for index, one in enumerate(opened) if one.id == told.id), None)
+    index = next((index for index, one in enumerate(opened) if one.id == update.id), None)
     if index is None:
         return state
     before = opened[index]
-    episode = told.episode or before.episode
-    opened[index] = after = replace(before, episode=episode, scene=told.scene, making=told.making)
+    episode = update.episode or before.episode
+    opened[index] = after = replace(before, episode=episode, scene=update.scene, making=update.making)
     got_scene = after.has_scene and not before.has_scene
     return _with(state, opened=tuple(opened), opened_serial=state.view.opened_serial + got_scene)

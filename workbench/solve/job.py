@@ -125,4 +125,4 @@ def _report(what: SolveOptions, recorded: Sequence[Written], seconds: float, sto
         for written, episode, total in zip(recorded, planned, totals, strict=True)
     ]
     report = SolveReport(tuple(rows), (), seconds, stopped, what.seeds)
-    return replace(report, verdicts=tuple(of_episodes(planned))) if report.tells else report
+    return replace(report, verdicts=tuple(of_episodes(planned))) if report.has_enough_seeds else report

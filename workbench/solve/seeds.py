@@ -60,7 +60,7 @@ class SeedsView:
 
 
 @dataclass(frozen=True)
-class SeedsTold:
+class SeedsUpdate:
     """An update from the solving process."""
 
     activity: str = ""
@@ -98,7 +98,7 @@ class EndSeeds:
     """Stop the job."""
 
 
-SeedsEvent = SeedsTold | SeedsDone | SeedsFailed
+SeedsEvent = SeedsUpdate | SeedsDone | SeedsFailed
 SeedsEffect = BeginSeeds | EndSeeds
 Change = tuple[SeedsView, list[SeedsEffect]]
 """The results after an event, and the effects to perform."""
@@ -123,7 +123,7 @@ def apply(view: SeedsView, event: object, run: Run) -> Change:
             return _changed(view, state="stopped", activity=""), [EndSeeds()]
         case VersionLoaded() if view.report is not None:
             return _changed(view, stale=True), []
-        case SeedsTold() if running:
+        case SeedsUpdate() if running:
             return _take(view, event), []
         case SeedsDone() if running:
             return _changed(view, state="done", activity=""), []
@@ -143,12 +143,12 @@ def _solve(view: SeedsView, run: Run) -> Change:
     return begun, [BeginSeeds(load.task, load.options, view.chosen, run.settings.plan)]
 
 
-def _take(view: SeedsView, told: SeedsTold) -> SeedsView:
-    if told.report is not None:
-        return _changed(view, state="solving", report=told.report)
-    if told.done is not None:
-        return _changed(view, state="solving", done=told.done, activity=told.activity)
-    return _changed(view, activity=told.activity)
+def _take(view: SeedsView, update: SeedsUpdate) -> SeedsView:
+    if update.report is not None:
+        return _changed(view, state="solving", report=update.report)
+    if update.done is not None:
+        return _changed(view, state="solving", done=update.done, activity=update.activity)
+    return _changed(view, activity=update.activity)
 
 
 def _changed(view: SeedsView, **values: Any) -> SeedsView:
@@ -202,13 +202,13 @@ class SeedsJobs:
         """Run the job on its own thread."""
         if job.stopped:
             return
-        work = Work(_run, setup, SolveReport, SeedsTold, "that solves")
+        work = Work(_run, setup, SolveReport, SeedsUpdate, "that solves")
 
-        def tell(update: SeedsTold) -> None:
+        def tell(update: SeedsUpdate) -> None:
             post(lambda: job.stopped or self._happen(update))
 
-        deal: Scheduler[SolveReport, SeedsTold] = Scheduler(
-            range(1), lambda number, report: tell(SeedsTold(report=report)), tell, lambda: job.stopped
+        deal: Scheduler[SolveReport, SeedsUpdate] = Scheduler(
+            range(1), lambda number, report: tell(SeedsUpdate(report=report)), tell, lambda: job.stopped
         )
         try:
             Processes(1).run(work, deal)
@@ -235,12 +235,12 @@ def _run(setup: _Setup, queue: ItemQueue) -> None:
     what = SolveOptions(setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=options)
     report = solve(
         what,
-        on_activity=lambda activity: queue.send_update(SeedsTold(activity)),
+        on_activity=lambda activity: queue.send_update(SeedsUpdate(activity)),
         on_progress=lambda now: queue.send_update(
-            SeedsTold(underway_text(now.by_seed(0), now.limit), now.done)
+            SeedsUpdate(underway_text(now.by_seed(0), now.limit), now.done)
         ),
         stop=lambda: queue.limit() == 0,
         on_finding=lambda finding: None,
-        on_report=lambda report: queue.send_update(SeedsTold(report=report)),
+        on_report=lambda report: queue.send_update(SeedsUpdate(report=report)),
     )
     queue.send_result(0, report)

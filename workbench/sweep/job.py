@@ -19,7 +19,7 @@ from workbench.episodes.sweep_results import MAX_POINTS, SweepEpisode, SweepResu
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.scheduler import Executor, Failure, Scheduler, ThisProcess
 from workbench.planning.options import PlanOptions
-from workbench.record.job import MAX_CHUNK_STARTS, RecordProgress, ToldByWorkers, chunk_of, do_record
+from workbench.record.job import MAX_CHUNK_STARTS, RecordProgress, WorkerUpdates, chunk_of, do_record
 from workbench.record.job_worker import RecordOptions, RecordUpdate, Written, with_given_actions
 from workbench.task import registry
 from workbench.task.constructor_arguments import class_arguments
@@ -263,7 +263,7 @@ class _Sweep:
     ) -> None:
         self._what, self._points, self._stride = what, what.points, what.stride
         self._on_progress = on_progress
-        self._told = ToldByWorkers(on_activity, on_finding, on_notice)
+        self._updates = WorkerUpdates(on_activity, on_finding, on_notice)
         self._rows: dict[int, SweepEpisode] = {}
         self._kept = 0
         """Number of rows without a failure."""
@@ -304,20 +304,20 @@ class _Sweep:
         )
 
     def _over(self, number: int, written: Written | None) -> None:
-        self._told.over(number)
+        self._updates.over(number)
         self._rows[number] = self._row(number, written)
         self._kept += 1
         self._tell((number, written))
 
     def _failed(self, failure: Failure) -> None:
-        self._told.failed(failure)
+        self._updates.failed(failure)
         for number in failure.numbers:
             self._rows[number] = self._row(number, None, str(TaskError(failure.problem)))
         self._tell()
 
     def _on_update(self, update: RecordUpdate) -> None:
-        if self._told.take(update):
+        if self._updates.take(update):
             self._tell()
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
-        self._on_progress(self._told.progress(self._kept, over, self.scheduler, counts_parts=True))
+        self._on_progress(self._updates.progress(self._kept, over, self.scheduler, counts_parts=True))

@@ -310,15 +310,15 @@ def test_a_repeated_message_is_logged_less_and_less_often(monkeypatch):
     said: list[str] = []
     log = RateLimitedLog(said.append, pause=60.0)
     for _ in range(4 * 3600):
-        log.happened("a", "It happened.")
+        log.add("a", "It happened.")
         now[0] += 1.0
     assert said[:2] == ["It happened.", "It happened. (59 more times since the last message.)"]
     assert len(said) < 12
     lines = len(said)
     for _ in range(2):
-        log.say_the_rest()
+        log.flush()
     assert len(said) == lines + 1, "suppressed messages are reported once"
     suppressed = sum(int(number) for line in said for number in re.findall(r"\((\d+) more times", line))
     assert lines + suppressed == 4 * 3600
-    log.happened("b", "Another\x1b[2J\nthing\u202e.")
+    log.add("b", "Another\x1b[2J\nthing\u202e.")
     assert said[-1] == r"Another\x1b[2J\nthing\u202e."

@@ -421,7 +421,7 @@ class Worker:
             old.policy_folder,
         ):
             self._task.run("importing the policy", self._use_action_source)
-            self._task.guarded(self._send_told)
+            self._task.guarded(self._send_slider_action)
 
     def _tell(self, request: SetSliderAction) -> None:
         def tell(opened: OpenedTask) -> None:
@@ -432,11 +432,11 @@ class Worker:
                 task.parts
             ):
                 self._chooser.tell(task, request.env_idx, request.dimensions, request.values)
-                self._send_told(opened)
+                self._send_slider_action(opened)
 
         self._task.guarded(tell)
 
-    def _send_told(self, opened: OpenedTask) -> None:
+    def _send_slider_action(self, opened: OpenedTask) -> None:
         if self._chooser.by_sliders:
             self._line.send(SliderAction(self._chooser.slider_action(opened.env)))
 
@@ -664,7 +664,7 @@ class Worker:
         self._shares.add("recorded", self._steps.recording_took, time.monotonic())
         self._cameras.scene_changed()
         self._line.send(event)
-        self._send_told(self._task.opened)
+        self._send_slider_action(self._task.opened)
 
     # --- status and findings -----------------------------------------------------------------------
 

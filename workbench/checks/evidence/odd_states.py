@@ -60,7 +60,7 @@ class OddStates:
     """(R, N) by reward mode: the mode of the env, and the dense modes that the class has."""
     obs: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
     """(R,) observations, (N, D) by leaf, without pictures."""
-    told: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    reward_if_success: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
     """As `reward`, with ``info["success"]`` set to true in all envs; NaN where the reward raised. Empty if evaluate() has no
     entry success."""
 
@@ -125,21 +125,21 @@ def _ask(checkup: Checkup, task: TaskEnv, action: NDArray[np.float32], seen: Odd
         seen.reward.setdefault(mode, []).append(_rows(reward, task.num_envs))
         if "success" in info:
             with remembering(task.env):
-                _tell_success(seen, mode, hook, obs, given, info, task.num_envs)
+                _add_reward_if_success(seen, mode, hook, obs, given, info, task.num_envs)
 
 
-def _tell_success(
+def _add_reward_if_success(
     seen: OddStates, mode: str, hook: Any, obs: Any, action: Any, info: dict[str, Any], num_envs: int
 ) -> None:
     success = info["success"]
-    told = {**info, "success": torch.ones_like(success) if isinstance(success, torch.Tensor) else True}
+    successful = {**info, "success": torch.ones_like(success) if isinstance(success, torch.Tensor) else True}
     try:
-        rows = _rows(hook(obs=obs, action=action, info=told), num_envs)
+        rows = _rows(hook(obs=obs, action=action, info=successful), num_envs)
     except Exception:
         # Not the task's fault: the state is no success, and the hook may rely on other conditions of a
         # success.
         rows = np.full(num_envs, np.nan)
-    seen.told.setdefault(mode, []).append(rows)
+    seen.reward_if_success.setdefault(mode, []).append(rows)
 
 
 def _rows(reward: Any, num_envs: int) -> NDArray[np.float64]:

@@ -188,10 +188,10 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:
     """The reward with ``info["success"]`` set to true, if it is the same number in all states; else None."""
-    told = np.concatenate([*seen.told.get(mode, ()), np.zeros(0)])
-    if not len(told) or not np.isfinite(told).all() or np.ptp(told) > ROUNDING:
+    paid = np.concatenate([*seen.reward_if_success.get(mode, ()), np.zeros(0)])
+    if not len(paid) or not np.isfinite(paid).all() or np.ptp(paid) > ROUNDING:
         return None
-    return float(told[0])
+    return float(paid[0])
 
 
 @rule("reward-ratio", "warn", "compute_normalized_dense_reward")
@@ -222,7 +222,7 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     if not DENSE_HOOKS.keys() <= seen.reward.keys():
         raise NotApplicable("the task lacks a dense or a normalized dense reward")
     dense, normalized = (
-        np.concatenate([*seen.reward[mode], *seen.told.get(mode, ())]) for mode in DENSE_HOOKS
+        np.concatenate([*seen.reward[mode], *seen.reward_if_success.get(mode, ())]) for mode in DENSE_HOOKS
     )
     finite = np.isfinite(dense) & np.isfinite(normalized)
     size = float(np.abs(dense[finite]).max(initial=0))

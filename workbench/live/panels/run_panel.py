@@ -25,7 +25,7 @@ from workbench.live.commands import (
     SetSeed,
     UseControlMode,
 )
-from workbench.live.events import ActionTold
+from workbench.live.events import SlidersMoved
 from workbench.live.history.curves import columns_by_label
 from workbench.live.messages import EpisodeEnd
 from workbench.live.pause_when import Test
@@ -92,9 +92,9 @@ class ActionSliders:
         self._folder.visible = shown and bool(self._dimensions)
         self._which.visible = view.task is not None and view.task.num_envs > 1
         self._which.show(self._moved)
-        if not self._folder.visible or view.told is None:
+        if not self._folder.visible or view.slider_action is None:
             return
-        action = view.told[min(view.selected_env, len(view.told) - 1)]
+        action = view.slider_action[min(view.selected_env, len(view.slider_action) - 1)]
         for one, dimension, value in zip(self._sliders, self._dimensions, action, strict=False):
             low, high = slider_bounds(dimension)
             # A policy's action may lie outside the bounds.
@@ -108,9 +108,9 @@ class ActionSliders:
                 if dimension >= len(self._dimensions):
                     raise Refused(f"The robot's action has only {len(self._dimensions)} dimensions.")
                 low, high = slider_bounds(self._dimensions[dimension])
-                self._session.happen(ActionTold((dimension,), (min(max(value, low), high),), envs))
+                self._session.happen(SlidersMoved((dimension,), (min(max(value, low), high),), envs))
             case HoldStill():
-                self._session.happen(ActionTold((), (), envs))
+                self._session.happen(SlidersMoved((), (), envs))
             case ChooseMoved(envs=moved):
                 self._moved = moved
 

@@ -48,14 +48,14 @@ class ForkEnded:
 class ForkedKeeper:
     """The keeper of a forked worker. Thread-safe."""
 
-    def __init__(self, told: socket.socket, stdout: int, stderr: int) -> None:
+    def __init__(self, report_socket: socket.socket, stdout: int, stderr: int) -> None:
         """
         Args:
-            told: socket on which the fork server reports the worker's start and end.
+            report_socket: socket on which the fork server reports the worker's start and end.
         """
         self.stdout: IO[bytes] | None = open(stdout, "rb", buffering=0)
         self.stderr: IO[bytes] | None = open(stderr, "rb", buffering=0)
-        self._told = told
+        self._report_socket = report_socket
         self._pid = 0
         self._code: int | None = None
         self._terminated = False
@@ -70,9 +70,9 @@ class ForkedKeeper:
     def poll(self) -> int | None:
         """Exit code; None while the process runs. If the fork server is killed, its workers are killed too."""
         with self._lock:
-            while self._code is None and has_come(self._told):
+            while self._code is None and has_come(self._report_socket):
                 try:
-                    data = self._told.recv(_MAX_MESSAGE_BYTES)
+                    data = self._report_socket.recv(_MAX_MESSAGE_BYTES)
                 except ConnectionResetError:
                     data = b""
                 message = Unpacker((Forked, ForkEnded)).message(data) if data else ForkEnded(-signal.SIGKILL)
@@ -84,7 +84,7 @@ class ForkedKeeper:
                 # The worker will never be forked, but the fork server reports that only after its imports.
                 self._code = -signal.SIGTERM
             if self._code is not None:
-                self._told.close()
+                self._report_socket.close()
             return self._code
 
     def wait(self, timeout: float | None = None) -> int:
@@ -95,7 +95,7 @@ class ForkedKeeper:
             if left is not None and left <= 0:
                 assert timeout is not None
                 raise subprocess.TimeoutExpired("a worker", timeout)
-            has_come(self._told, left)
+            has_come(self._report_socket, left)
         return code
 
     def terminate(self) -> None:
@@ -110,7 +110,7 @@ class ForkedKeeper:
         if self.poll() is None:
             with self._lock:
                 try:
-                    self._told.send(pack(int(number)))
+                    self._report_socket.send(pack(int(number)))
                 except OSError:
                     pass  # the process has ended; `poll` returns its exit code
 

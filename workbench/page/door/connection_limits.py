@@ -52,8 +52,8 @@ class ConnectionLimits:
     holds some idle sockets, and opens new ones when these are closed.)
     """
 
-    def __init__(self, told: RateLimitedLog) -> None:
-        self._told = told
+    def __init__(self, events_log: RateLimitedLog) -> None:
+        self._events_log = events_log
         self._waiting: dict[Connection, str] = {}
 
     def __len__(self) -> int:
@@ -70,7 +70,7 @@ class ConnectionLimits:
             oldest = next(one for one, its_peer in self._waiting.items() if its_peer == busiest)
             self.left(oldest)
             oldest.transport.abort()
-            self._told.happened(
+            self._events_log.add(
                 "crowd",
                 f"{MAX_WITHOUT_TOKEN} connections are open without the token{of_peer(busiest)}; the oldest are closed.",
             )
@@ -157,7 +157,7 @@ def unsent(connection: ServerConnection) -> int:
 
 
 async def close_when_stalled(
-    connection: ServerConnection, told: RateLimitedLog, unanswered: Callable[[], int] = lambda: 0
+    connection: ServerConnection, events_log: RateLimitedLog, unanswered: Callable[[], int] = lambda: 0
 ) -> None:
     """Close the connection when its client has read nothing for `READ_TIMEOUT_SECONDS`. Run it as a task of the connection.
 
@@ -180,7 +180,7 @@ async def close_when_stalled(
         # Count checks, not seconds: while this machine sleeps no client can read.
         silent = 0 if left == 0 or left < before else silent + 1
         before = left
-    told.happened(
+    events_log.add(
         "stalled",
         f"Closed the connection of a browser that has read nothing for {READ_TIMEOUT_SECONDS:.0f} s. "
         "The browser may reconnect.",
@@ -203,19 +203,19 @@ class RateLimitedLog:
     seconds, and the pause doubles with each line. Thread-safe.
 
     Args:
-        say: Prints one line.
+        print_line: prints one line.
         pause: Seconds of the first pause.
     """
 
-    def __init__(self, say: Callable[[str], None] = log.warning, pause: float = PAUSE_SECONDS) -> None:
-        self._say, self._pause = say, pause
+    def __init__(self, print_line: Callable[[str], None] = log.warning, pause: float = PAUSE_SECONDS) -> None:
+        self._print_line, self._pause = print_line, pause
         self._silent_until: dict[Hashable, float] = {}
         self._pauses: dict[Hashable, float] = {}
-        self._untold: dict[Hashable, tuple[int, str]] = {}
+        self._held_back: dict[Hashable, tuple[int, str]] = {}
         """Number of lines held back, and the last of these lines, by kind."""
         self._lock = threading.Lock()
 
-    def happened(self, kind: Hashable, sentence: str, error: BaseException | None = None) -> None:
+    def add(self, kind: Hashable, sentence: str, error: BaseException | None = None) -> None:
         """Log an event, or count it if its kind was logged recently.
 
         Args:
@@ -226,7 +226,7 @@ class RateLimitedLog:
         now = time.monotonic()
         with self._lock:
             if now < self._silent_until.get(kind, 0.0):
-                self._untold[kind] = self._untold.get(kind, (0, ""))[0] + 1, sentence
+                self._held_back[kind] = self._held_back.get(kind, (0, ""))[0] + 1, sentence
                 return
             if len(self._pauses) >= MAX_KINDS:
                 rest = self._forget()
@@ -235,27 +235,27 @@ class RateLimitedLog:
             pause = self._pauses.get(kind, self._pause)
             self._silent_until[kind] = now + pause
             self._pauses[kind] = min(2 * pause, MAX_PAUSE_SECONDS)
-            before, _ = self._untold.pop(kind, (0, ""))
+            before, _ = self._held_back.pop(kind, (0, ""))
         for line in rest:
-            self._say(line)
+            self._print_line(line)
         if error is None:
-            self._say(_line(sentence, before))
+            self._print_line(_line(sentence, before))
         else:
             log.error("%s", _line(sentence, before), exc_info=error)
 
-    def say_the_rest(self) -> None:
+    def flush(self) -> None:
         """Log all lines that were held back; for the end of the program."""
         with self._lock:
             rest = self._forget()
         for line in rest:
-            self._say(line)
+            self._print_line(line)
 
     def _forget(self) -> tuple[str, ...]:
         """Reset all kinds; returns the lines that were held back."""
-        rest = tuple(_line(sentence, times) for times, sentence in self._untold.values())
+        rest = tuple(_line(sentence, times) for times, sentence in self._held_back.values())
         self._silent_until.clear()
         self._pauses.clear()
-        self._untold.clear()
+        self._held_back.clear()
         return rest
 
 

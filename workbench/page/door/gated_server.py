@@ -172,19 +172,19 @@ class GatedServer:
         atexit.unregister(self.close)
         self._gated.stop()
         self._listening.remove()
-        self._access_check.say_the_rest()
+        self._access_check.flush()
 
 
 class _AccessCheck:
     """Decides on each request, answers it, and reports refused ones in the terminal."""
 
-    def __init__(self, rules: access.AccessRules, example: str, told: RateLimitedLog) -> None:
+    def __init__(self, rules: access.AccessRules, example: str, events_log: RateLimitedLog) -> None:
         self.rules = rules
         self.turned_away = 0
-        self.tells = False
+        self.reports_refusals = False
         """Whether refusals are counted and reported; not during the server's own test."""
         self._refuse = refusals(example)
-        self._told = told
+        self._events_log = events_log
 
     async def answer(
         self,
@@ -207,19 +207,21 @@ class _AccessCheck:
         connection.close_timeout = RESPONSE_SECONDS
         if isinstance(decision, access.Entered):
             return entered_reply(decision)
-        return await admitted_reply(routes, viser_hook, connection, request, decision.authority, self._told)
+        return await admitted_reply(
+            routes, viser_hook, connection, request, decision.authority, self._events_log
+        )
 
-    def say_the_rest(self) -> None:
+    def flush(self) -> None:
         """Print lines that were held back, and the number of refused requests; for the end of the program."""
-        self._told.say_the_rest()
+        self._events_log.flush()
         if self.turned_away > 1:
-            self._told.happened("total", f"{self.turned_away} requests were refused in total.")
+            self._events_log.add("total", f"{self.turned_away} requests were refused in total.")
 
     def _count(self, refused: access.RefusedRequest, connection: ServerConnection) -> None:
-        if self.tells:
+        if self.reports_refusals:
             self.turned_away += 1
             peer = connection.peer if isinstance(connection, Connection) else ""
-            self._told.happened(refused.why, TURNED_AWAY[refused.why].format(of_peer(peer)))
+            self._events_log.add(refused.why, TURNED_AWAY[refused.why].format(of_peer(peer)))
 
 
 def open_server(options: ServerOptions = ServerOptions(), label: str | None = None) -> GatedServer:
@@ -241,15 +243,17 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
         listening = listen_on_file(options.socket, options.port)
     token = secrets.token_urlsafe(32) if options.token else None
     rules = access.AccessRules(token=token, names=_our_names(options), any_address=not listening.loopback)
-    told = RateLimitedLog()
-    access_check = _AccessCheck(rules, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
+    events_log = RateLimitedLog()
+    access_check = _AccessCheck(
+        rules, f"http://{listening.authority}/" + ("?token=…" if token else ""), events_log
+    )
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
 
     def wrap(viser_hook: viser_private.Hook) -> viser_private.AsyncHook:
         return functools.partial(access_check.answer, routes, viser_hook)
 
     try:
-        gated = viser_private.make_viser(listening.socket, wrap, label, RESPONSE_SECONDS, told)
+        gated = viser_private.make_viser(listening.socket, wrap, label, RESPONSE_SECONDS, events_log)
     except BaseException:
         listening.remove()
         raise
@@ -281,7 +285,7 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
     except BaseException:
         gated_server.close()
         raise
-    access_check.tells = True
+    access_check.reports_refusals = True
     gated_server.add_route("/workbench/", folder_handler(web_assets_folder()))
     return gated_server
 

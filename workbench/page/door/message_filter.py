@@ -37,12 +37,12 @@ class PageGuard:
     other pages keep their share of the event loop.
     """
 
-    def __init__(self, is_of_viser: Callable[[str], bool], told: RateLimitedLog) -> None:
+    def __init__(self, is_of_viser: Callable[[str], bool], events_log: RateLimitedLog) -> None:
         """
         Args:
             is_of_viser: whether viser has a message of this kind.
         """
-        self._is_of_viser, self._told = is_of_viser, told
+        self._is_of_viser, self._events_log = is_of_viser, events_log
         self._level, self._at = BURST_MESSAGES, time.monotonic()
         self._slowed, self._turns = 0.0, 0
 
@@ -79,7 +79,7 @@ class PageGuard:
         if kind not in KINDS:
             if not self._is_of_viser(kind):
                 raise MalformedMessage("a message of an unknown type")
-            self._told.happened(
+            self._events_log.add(
                 kind, f"Dropped a message from a page: the workbench takes no {kind} from pages."
             )
             return False
@@ -87,6 +87,6 @@ class PageGuard:
         try:
             read_message(raw, kind)
         except ImpossibleValue as error:
-            self._told.happened(kind, f"Dropped a message from a page: {error}, in {kind}.")
+            self._events_log.add(kind, f"Dropped a message from a page: {error}, in {kind}.")
             return False
         return True

@@ -88,7 +88,7 @@ async def admitted_reply(
     connection: ServerConnection,
     request: Request,
     authority: str,
-    told: RateLimitedLog,
+    events_log: RateLimitedLog,
 ) -> Response:
     """The reply to an admitted request, from the route with the longest matching prefix; from viser if no
     route matches.
@@ -122,7 +122,7 @@ async def admitted_reply(
         try:
             made = handler(path[len(prefix) :], dict(parse_qsl(request.path.partition("?")[2])))
         except Exception as error:
-            told.happened(("route", prefix), f"The route {prefix} failed on {short_line(path, 200)}.", error)
+            events_log.add(("route", prefix), f"The route {prefix} failed on {short_line(path, 200)}.", error)
             made = 500, "text/plain; charset=utf-8", b"This request failed; the terminal shows the error."
         if isinstance(made, FileReply):
             return made

@@ -210,7 +210,7 @@ def _is_of_viser(kind: str) -> bool:
     return isinstance(known, type) and issubclass(known, viser._messages.Message)
 
 
-def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -> Serve:
+def _watched(handler: Serve, channels: dict[str, Serve], events_log: RateLimitedLog) -> Serve:
     async def watched(connection: ServerConnection) -> None:
         request = connection.request
         if request is not None and (ours := channels.get(urlsplit(request.path).path)) is not None:
@@ -218,11 +218,11 @@ def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -
             return
         if connection.subprotocol != f"viser-v{viser.__version__}":
             # Handled here, since viser prints the client's version, of any length, and sends it back.
-            told.happened("version", "Refused a page that another version of viser has served: reload it.")
+            events_log.add("version", "Refused a page that another version of viser has served: reload it.")
             await connection.close(1002, f"Version mismatch. Server: {viser.__version__}")
             return
         receive = connection.recv
-        guard = PageGuard(_is_of_viser, told)
+        guard = PageGuard(_is_of_viser, events_log)
 
         async def receive_checked() -> object:
             while True:
@@ -234,13 +234,13 @@ def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -
         line = PageConnection(connection)
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
         connection.send = line.send  # type: ignore[method-assign,assignment]
-        listening = asyncio.create_task(close_when_stalled(connection, told, lambda: line.unanswered))
+        listening = asyncio.create_task(close_when_stalled(connection, events_log, lambda: line.unanswered))
         try:
             await handler(connection)
         except MalformedMessage as error:
             # Without this `websockets` closes the connection too, but prints a traceback into the author's terminal for
             # every such frame.
-            told.happened("malformed", f"Closed a page's connection: it sent {error}.")
+            events_log.add("malformed", f"Closed a page's connection: it sent {error}.")
             # The page may keep sending and never answer the closing handshake.
             connection.close_timeout = STOP_SECONDS
             await connection.close(1008, "malformed message")
@@ -256,7 +256,7 @@ class _Terminal(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
-        self.told = RateLimitedLog()
+        self.events_log = RateLimitedLog()
         self._installed = False
 
     def install(self) -> None:
@@ -284,13 +284,13 @@ class _Terminal(logging.Filter):
         error = record.exc_info[1] if record.exc_info else None
         if record.levelno >= logging.ERROR and not _has_left(error):
             kind = record.name, record.pathname, record.lineno, type(error)
-            self.told.happened(kind, record.getMessage(), error)
+            self.events_log.add(kind, record.getMessage(), error)
         return False
 
     def _callback_failed(self, kind: object, error: BaseException, *_: object) -> None:
         frames = traceback.extract_tb(error.__traceback__)
         place = (frames[-1].filename, frames[-1].lineno) if frames else None
-        self.told.happened(("callback", type(error), place), "A callback of a page failed.", error)
+        self.events_log.add(("callback", type(error), place), "A callback of a page failed.", error)
 
 
 _terminal = _Terminal()
@@ -355,7 +355,7 @@ def make_viser(
     wrap: Callable[[Hook], AsyncHook],
     label: str | None,
     response_seconds: float,
-    told: RateLimitedLog,
+    events_log: RateLimitedLog,
 ) -> GatedViser:
     """Make a `viser.ViserServer` that serves only on ``listening``, behind the hook that ``wrap`` makes from viser's own.
 
@@ -371,7 +371,7 @@ def make_viser(
         wrap: gets viser's ``process_request`` (files for plain requests, None for a handshake).
         label: shown at the top of viser's panel.
         response_seconds: timeout of one request including its whole response.
-        told: logs misbehaviour of pages.
+        events_log: logs misbehaviour of pages.
 
     Raises:
         ServerError: the installed viser is an unknown version. Nothing is left listening.
@@ -381,11 +381,11 @@ def make_viser(
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
     _terminal.install()
-    _terminal.told = told
+    _terminal.events_log = events_log
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     channels: dict[str, Serve] = {}
-    strangers = ConnectionLimits(told)
+    strangers = ConnectionLimits(events_log)
 
     def serve(handler: Serve, host: str, port: int, **options: Any) -> websockets.asyncio.server.serve:
         # Do not use viser's host and port: viser silently binds another port if this one is taken, or the port of the
@@ -400,7 +400,7 @@ def make_viser(
             unix=listening.family == socket.AF_UNIX,
             logger=_quiet_logger(),
         )
-        made = real_serve(_watched(handler, channels, told), sock=listening, **options)
+        made = real_serve(_watched(handler, channels, events_log), sock=listening, **options)
         serving.append(made)
         return made
 

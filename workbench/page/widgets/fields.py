@@ -112,11 +112,11 @@ class Field:
         if self._options is not None:
             several = [json.dumps(one) for one in several]
         more = {"options": self._options, "bounds": self._bounds}
-        told = {name: one for name, one in more.items() if one is not None}
+        changed = {name: one for name, one in more.items() if one is not None}
         self._shown.content = render(
             "shows",
             shows=json.dumps(
-                [[name, one, off, told] for name, one in zip(self._names, several, strict=True)]
+                [[name, one, off, changed] for name, one in zip(self._names, several, strict=True)]
             ),
         )
 

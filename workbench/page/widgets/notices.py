@@ -22,7 +22,7 @@ def tell_all(
 
 
 @contextmanager
-def refusals_told(
+def refusals_shown(
     client: viser.ClientHandle | None,
     title: str = "Not possible",
     then: Callable[[], None] = lambda: None,

@@ -82,7 +82,7 @@ class Visitors:
         self.commands = commands
         self.do: Do = _nothing
         """Carries out a command on the shown page; set by `app.server`, refuses until then."""
-        self._told = RateLimitedLog()
+        self._events_log = RateLimitedLog()
         self._by_name: dict[str, Visitor] = {}
         self._by_client: dict[int, Visitor] = {}
         server.on_client_connect(self._came)
@@ -154,7 +154,7 @@ class Visitors:
                 else:
                     refused = await self.ask(command, visitor)
             except (msgspec.DecodeError, UnicodeDecodeError, KeyError) as fault:
-                self._told.happened(
+                self._events_log.add(
                     "malformed", f"Closed a page's connection: it sent no valid command ({fault!r})."
                 )
                 await connection.close(1008, "malformed message or unknown command")
