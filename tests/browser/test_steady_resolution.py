@@ -124,7 +124,7 @@ def test_meshes_are_simplified_only_while_every_page_uses_software_rendering(
 ) -> None:
     in_software = InSoftware(gated_server.server)
     visitors = Visitors(gated_server.server, COMMANDS)
-    visitors.do = lambda command, visitor: in_software.drawn_by_visitor(visitor)
+    visitors.do = lambda command, visitor: in_software.report_arrived(visitor)
     gated_server.add_channel(PATH, visitors.serve)
     page = show()
     until(lambda: len(gated_server.server.get_clients()) == 1, "the page")

@@ -380,7 +380,7 @@ class Page:
             case TellUnfolded(panel=panel):
                 self._unfolded(panel)
             case TellDrawnInSoftware():
-                self._in_software.drawn_by_visitor(visitor)
+                self._in_software.report_arrived(visitor)
             case ToggleTable():
                 self._toggle_envs()
             case ToggleTimeline():

@@ -436,7 +436,7 @@ class ReviewPage:
             case TellUnfolded(panel=panel):
                 self._panel_unfolded(panel)
             case TellDrawnInSoftware():
-                self._shared.stage.in_software.drawn_by_visitor(visitor)
+                self._shared.stage.in_software.report_arrived(visitor)
             case ToggleTable():
                 self._show_library(not self._library_open)
             case ToggleTimeline():

@@ -61,7 +61,7 @@ class StartPage:
             case _ if isinstance(command, TaskList.does):
                 return self._list.do(command, visitor)
             case TellDrawnInSoftware():
-                self._shared.stage.in_software.drawn_by_visitor(visitor)
+                self._shared.stage.in_software.report_arrived(visitor)
             case _:
                 raise Refused(f"Not on this page: {command.help()}.")
         return None

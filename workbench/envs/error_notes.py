@@ -41,7 +41,7 @@ def notes_of(error: BaseException) -> list[str]:
 class CoreRefusal(Exception):
     """The batched core refuses a call or a value of a task.
 
-    The running `AuthorCall` remembers the refusal: the task may catch it, and later fail because of it.
+    The running `AuthorCall` stores the refusal: the task may catch the error, and later fail because of it.
     `place` is the line at fault, if the traceback does not show it.
     """
 

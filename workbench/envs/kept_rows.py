@@ -116,8 +116,8 @@ def _is_outside_the_agent(path: str) -> bool:
 
 
 def _paths(walk: Walk, num_envs: int) -> tuple[list[str], dict[str, list[str]]]:
-    """Paths of values with a row for each env; and groups of N paths, one for each env, as for a list of N
-    tensors."""
+    """(paths, groups). The paths are those of values with a row for each env. A group is N paths that differ only
+    in a list index 0..N-1, such as the paths of N tensors in a list, one for each env."""
     single, items = [], {}
     for leaf in walk.leaves:
         if not _is_outside_the_agent(leaf.path):

@@ -144,108 +144,133 @@ parse_cameras: Callable[[Any], dict[str, Any]] = (
 _TARGETS_OF = "_workbench_targets_of"
 
 
+SystemOf = Callable[[Any], Any]
+"""Returns the system of a batched scene, None for any other scene."""
+
+
 @cache
-def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
+def install_row_lookups(batched_system: SystemOf) -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system.
 
     Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, which raise for a CPU
     system. ManiSkill's builders make the structs, so the structs' cached properties of these indices are
     replaced, once per process; for a stock scene the new properties run the original code. Safe to call
     again.
-
-    Args:
-        batched_system: returns the system of a batched scene, None for any other scene.
     """
-    stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
-    stock_set_ee_action = PDEEPosController.set_action
-    stock_get_contacts = ManiSkillScene.get_contacts
+    bodies, joints = PhysxRigidBodyComponentStruct, ArticulationJoint
+    _find_rows(batched_system, bodies, "_body_data_index", "_bodies", "row", torch.int64)
+    _find_rows(batched_system, Articulation, "_data_index", "_objs", "index", torch.int32)
+    _find_rows(batched_system, joints, "_data_index", "_physx_articulations", "index", torch.int32)
+    Articulation.get_joint_target_indices = _joint_target_indices(batched_system)  # type: ignore[method-assign]
+    Link._body_data = property(_link_data(batched_system))  # type: ignore[method-assign,assignment]
+    ManiSkillScene.get_contacts = _get_contacts(batched_system)  # type: ignore[method-assign]
+    if why_not(POSE_CONTROL):
+        return
+    PDEEPosController.set_action = _set_ee_action(batched_system)  # type: ignore[method-assign]
+    for controller in (PDEEPosController, PDEEPoseController):
+        check = _check_frame(batched_system, controller._check_gpu_sim_works)
+        controller._check_gpu_sim_works = check  # type: ignore[method-assign,assignment]
 
-    @wraps(stock_body_data)
+
+def _find_rows(
+    batched_system: SystemOf, owner: type, name: str, things: str, find: str, dtype: torch.dtype
+) -> None:
+    """Replace the cached property `name` of a struct: for a batched CPU scene it returns the row of each
+    object in the struct's attribute `things`."""
+    stock = owner.__dict__[name].func
+
+    @wraps(stock)
+    def rows(self: Any) -> torch.Tensor:
+        known = self.__dict__.get(name)
+        system = batched_system(self.scene)
+        if known is not None and (system is None or known[0] == system.layout_version):
+            return known[1]
+        if system is None:
+            found = 0, stock(self)
+        else:
+            place = system.row_of if find == "row" else system.index_of
+            version = system.layout_version
+            each = [place(thing) for thing in getattr(self, things)]
+            if version != system.layout_version:
+                # An unknown body made the system lay out the scene again.
+                each = [place(thing) for thing in getattr(self, things)]
+            found = system.layout_version, torch.tensor(each, device=self.device, dtype=dtype)
+        self.__dict__[name] = found
+        return found[1]
+
+    setattr(owner, name, property(rows, doc=stock.__doc__))
+
+
+def _joint_target_indices(batched_system: SystemOf) -> Callable[..., Any]:
+    """``Articulation.get_joint_target_indices``, whose cache is emptied when the rows of a batched scene
+    change."""
+    stock = Articulation.get_joint_target_indices
+
+    @wraps(stock)
+    def get_joint_target_indices(self: Any, joint_indices: Any) -> Any:
+        system = batched_system(self.scene)
+        if system is not None and self.__dict__.get(_TARGETS_OF) != system.layout_version:
+            self.__dict__[_TARGETS_OF] = system.layout_version
+            self._cached_joint_target_indices.clear()
+        return stock(self, joint_indices)
+
+    return get_joint_target_indices
+
+
+def _link_data(batched_system: SystemOf) -> Callable[[Any], torch.Tensor]:
+    """The getter of ``Link._body_data``; in a batched scene it fetches the velocities of links first."""
+    stock = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
+
+    @wraps(stock)
     def link_data(self: Any) -> torch.Tensor:
         # Only velocities are read this way (`Link.pose` reads the tensor itself). Velocities of roots are fetched with
         # every step, so reading only a root must not fetch all links.
         system = batched_system(self.scene)
         if system is not None and not self.is_root.all():
             system.fetch_link_velocities()
-        return stock_body_data(self)
+        return stock(self)
 
-    @wraps(stock_set_ee_action)
-    def set_ee_action(self: Any, action: torch.Tensor) -> None:
-        if batched_system(self.scene) is None:
-            stock_set_ee_action(self, action)
-        else:
-            _set_ee_action_of_each_env(self, action)
+    return link_data
 
-    def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Skip, in batched scenes, ManiSkill's check for a controller's ``frame`` that GPU simulation does
-        not support.
 
-        To detect GPU simulation, nightly builds read ``scene.gpu_sim_enabled``; release 3.0.1 reads the
-        device.
-        """
+def _get_contacts(batched_system: SystemOf) -> Callable[[Any], Any]:
+    stock = ManiSkillScene.get_contacts
 
-        @wraps(stock)
-        def check(self: Any) -> None:
-            if batched_system(self.scene) is None:
-                stock(self)
-
-        return check
-
-    @wraps(stock_get_contacts)
+    @wraps(stock)
     def get_contacts(self: Any) -> Any:
         # Nightly builds raise before they call the system, whose own error says what to call instead.
         system = batched_system(self)
-        return stock_get_contacts(self) if system is None else system.get_contacts()
+        return stock(self) if system is None else system.get_contacts()
 
-    def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
-        """Replace the cached property `name` of a struct: for a batched CPU scene it returns the row of each
-        object in the struct's attribute `things`."""
-        stock = owner.__dict__[name].func
+    return get_contacts
 
-        @wraps(stock)
-        def rows(self: Any) -> torch.Tensor:
-            known = self.__dict__.get(name)
-            system = batched_system(self.scene)
-            if known is not None and (system is None or known[0] == system.layout_version):
-                return known[1]
-            if system is None:
-                found = 0, stock(self)
-            else:
-                place = system.row_of if find == "row" else system.index_of
-                version = system.layout_version
-                each = [place(thing) for thing in getattr(self, things)]
-                if (
-                    version != system.layout_version
-                ):  # an unknown body made the system lay out the scene again
-                    each = [place(thing) for thing in getattr(self, things)]
-                found = system.layout_version, torch.tensor(each, device=self.device, dtype=dtype)
-            self.__dict__[name] = found
-            return found[1]
 
-        setattr(owner, name, property(rows, doc=stock.__doc__))
+def _check_frame(batched_system: SystemOf, stock: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Skip, in batched scenes, ManiSkill's check for a controller's ``frame`` that GPU simulation does not
+    support.
 
-    stock_targets = Articulation.get_joint_target_indices
+    To detect GPU simulation, nightly builds read ``scene.gpu_sim_enabled``; release 3.0.1 reads the device.
+    """
 
-    @wraps(stock_targets)
-    def get_joint_target_indices(self: Any, joint_indices: Any) -> Any:
-        system = batched_system(self.scene)
-        if system is not None and self.__dict__.get(_TARGETS_OF) != system.layout_version:
-            self.__dict__[_TARGETS_OF] = system.layout_version
-            self._cached_joint_target_indices.clear()
-        return stock_targets(self, joint_indices)
+    @wraps(stock)
+    def check(self: Any) -> None:
+        if batched_system(self.scene) is None:
+            stock(self)
 
-    Articulation.get_joint_target_indices = get_joint_target_indices
+    return check
 
-    find_rows(PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", "row", torch.int64)
-    find_rows(Articulation, "_data_index", "_objs", "index", torch.int32)
-    find_rows(ArticulationJoint, "_data_index", "_physx_articulations", "index", torch.int32)
-    Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
-    ManiSkillScene.get_contacts = get_contacts
-    if why_not(POSE_CONTROL):
-        return
-    PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
-    for controller in (PDEEPosController, PDEEPoseController):
-        controller._check_gpu_sim_works = check_frame(controller._check_gpu_sim_works)  # type: ignore[method-assign,assignment]
+
+def _set_ee_action(batched_system: SystemOf) -> Callable[[Any, torch.Tensor], None]:
+    stock = PDEEPosController.set_action
+
+    @wraps(stock)
+    def set_ee_action(self: Any, action: torch.Tensor) -> None:
+        if batched_system(self.scene) is None:
+            stock(self, action)
+        else:
+            _set_ee_action_of_each_env(self, action)
+
+    return set_ee_action
 
 
 def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:

@@ -107,7 +107,8 @@ class TaskDrawings:
         self._drawn = {name: drawing for name, drawing in self._drawn.items() if name in self._begun}
 
     def of_batch(self, num_envs: int) -> dict[str, Drawing]:
-        """The drawings with a row for each env; drawings of another number of envs are left out."""
+        """The drawings, by name, with a row for each of `num_envs` envs. A drawing with fewer rows gets NaN rows, which
+        draw nothing; a drawing with more rows is left out."""
         found = {}
         for name, drawing in self._drawn.items():
             if len(drawing.data) < num_envs:

@@ -41,7 +41,7 @@ from workbench.page.scene.body_pick import box_of_body
 from workbench.page.scene.env_grid import COLOUR, InView, view_label
 from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.keys_and_palette import with_key
-from workbench.page.widgets.notices import refusals_told
+from workbench.page.widgets.notices import refusals_shown
 from workbench.page.widgets.parts import PagePart, name_fold
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tools_html
@@ -300,7 +300,7 @@ class HandsPanel(PagePart[SessionView]):
         start, end = np.array(event.start_position), np.array(event.end_position)
 
         def handle() -> None:
-            with refusals_told(event.client, then=self.let_go):
+            with refusals_shown(event.client, then=self.let_go):
                 self.drag(event.client_id, event.phase, start, end)
 
         post(handle)
@@ -355,7 +355,7 @@ class HandsPanel(PagePart[SessionView]):
         """Handle a drag of the handles."""
         if client is None:
             return
-        with refusals_told(client, then=self.let_go):
+        with refusals_shown(client, then=self.let_go):
             if phase == "start" or self._drag is None:
                 of = self._required()
                 self._drag = _Drag(client.client_id, "move", of, np.zeros(3), of.pose, of.pose[:3])

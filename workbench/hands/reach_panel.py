@@ -17,7 +17,7 @@ from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.loop import post
 from workbench.page.scene.env_grid import InView, line_set, view_label
-from workbench.page.widgets.notices import refusals_told
+from workbench.page.widgets.notices import refusals_shown
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 
@@ -186,7 +186,7 @@ class ReachPanel(PagePart[SessionView]):
 
     def _turned(self, number: int, client: viser.ClientHandle | None, phase: str, pose: Floats) -> None:
         if client is not None and number < len(self._arms):
-            with refusals_told(client, then=self.let_go):
+            with refusals_shown(client, then=self.let_go):
                 self.drag(client.client_id, self._arms[number], phase, pose)
 
     def drag(self, client: int, arm: str, phase: str, pose: Floats) -> None:

@@ -183,7 +183,7 @@ class _ActorPool:
         return self._ray.get(reply)
 
     def _reap(self) -> None:
-        """End the actors that have removed their folders: an actor keeps its cores as long as it lives."""
+        """End the actors that have removed their folders: an actor keeps its cores until it ends."""
         if not self._ending:
             return
         ended = [actor.ended for actor in self._ending]

@@ -218,7 +218,7 @@ class EnterRecording:
     """The envs to set, all to the same state."""
     source_file: str | None = None
     source: Mapping[str, str] = field(default_factory=dict)
-    """The recorded source, to report what changed since; empty for no report."""
+    """The recorded source, to report what has changed since the recording; if empty, nothing is reported."""
     number: int = 0
     """The session's number of this request; returned unchanged."""
 

@@ -106,7 +106,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         raise NotImplementedError
 
     def _of_row(self, verdict: Verdict[Of]) -> dict[str, Any]:
-        """Values of a row for the template: the run's name, a hint, and whether it is selected."""
+        """Values of a row for the template: the run's name, a hint, and whether the row is selected."""
         raise NotImplementedError
 
     def _show(self, verdict: Verdict[Of]) -> None:

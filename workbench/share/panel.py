@@ -139,8 +139,8 @@ class SharePanel:
         self._tools = gui.add_html("")
         self._made = gui.add_html("")
 
-    def takes_opened(self, both: bool) -> bool:
-        """Whether to share the open recordings instead of the selected ones.
+    def choose_opened(self, both: bool) -> bool:
+        """Show the choice between open and selected recordings if both exist; returns whether to share the open ones.
 
         Args:
             both: whether some recordings are open and different ones are selected.
@@ -346,7 +346,7 @@ class SharePart(PagePart[ReviewView]):
     def draw(self, view: ReviewView) -> None:
         opened = {one.id: one.episode for one in view.opened}
         ids = self._table.selected()
-        if self._share.takes_opened(bool(ids) and bool(opened) and set(ids) != set(opened)):
+        if self._share.choose_opened(bool(ids) and bool(opened) and set(ids) != set(opened)):
             ids = ()
         rows = [row for row in map(self._library.row, ids or tuple(opened)) if row is not None]
         rows = [row for row in rows if row.problem is None]

@@ -19,7 +19,8 @@ _NEW_VALUES = set("dict list set tuple zip range sorted float int bool len sum m
 _MAKES_NEW = {"clone", "copy", "deepcopy", "tolist", "sum", "mean", "norm"}
 _PLAIN_DECORATORS = {"property", "staticmethod", "classmethod", "override"}
 _HOOK_ARGUMENTS = {"info", "obs", "action"}
-"""Names of hook arguments whose values ManiSkill creates for every step."""
+"""Hook arguments by name. ManiSkill creates new values for them in every step, so what the task writes into
+these values does not outlive the step."""
 
 
 def memoizing_statement(function: ast.AST, imported: Collection[str]) -> str | None:

@@ -69,12 +69,12 @@ def test_a_page_that_does_not_report_in_time_counts_as_using_a_gpu(
     monkeypatch.setattr("workbench.page.scene.software_rendering.REPORT_TIMEOUT_SECONDS", 0.05)
     server.come(1)
     assert not in_software.all_pages
-    in_software.drawn_by_visitor(server.visitor(1))
+    in_software.report_arrived(server.visitor(1))
     until(lambda: in_software.all_pages, "the page says so")
     server.come(2)
     assert in_software.all_pages, "nothing changes before the page's report is overdue"
     until(lambda: not in_software.all_pages, "the time is over")
-    in_software.drawn_by_visitor(server.visitor(2))
+    in_software.report_arrived(server.visitor(2))
     until(lambda: in_software.all_pages, "the late report")
     server.come(3)
     until(lambda: not in_software.all_pages, "the time is over")
@@ -91,7 +91,7 @@ def test_meshes_are_simplified_in_the_background_for_software_rendering() -> Non
     geometry, layout = heavy_scene()
     server.come(1)
     assert in_software.looks(DrawStyle(), geometry, layout, alone=False) == DrawStyle()
-    in_software.drawn_by_visitor(server.visitor(1))
+    in_software.report_arrived(server.visitor(1))
     until(lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 0, "simpler shapes")
     near = in_software.looks(DrawStyle(), geometry, layout, alone=False).error
     assert in_software.looks(DrawStyle(1_000_000), geometry, layout, alone=False).error == 0

@@ -21,8 +21,8 @@ _MAX_MESSAGE_BYTES = 1 << 12
 _STANDARD_FDS = (1, 2)
 """File descriptors of stdout and stderr."""
 _MAX_PRINTED_BYTES = 1 << 15
-"""Maximum number of bytes that are kept of what the imports print: they must fit into a pipe that is not read
-yet."""
+"""Maximum size of the imports' output that is kept: the output is written into a pipe before anything reads from
+the pipe, so it must fit into the pipe's buffer."""
 _NUM_FDS = 6
 """Number of file descriptors of a request: the socket on which the worker's exit is reported, the three
 descriptors that `start.run` takes, and the worker's stdout and stderr."""

@@ -34,8 +34,8 @@ _VERSION = 3
 """Version of the cached files; increase it when the levels change."""
 _MIN_FACES = 24
 _LOST_PIECE_ERROR, _USELESS_ERROR = 0.01, 0.1
-"""Errors relative to the size of the mesh: above the first, a piece of the mesh may be missing, so coarsening by pieces
-is tried too; above the second, no level is made."""
+"""Errors of a level, as shares of the mesh's longest side. Above the first, a piece of the mesh may be missing, so
+coarsening by pieces is tried too. Above the second, neither this level nor a coarser one is used."""
 _SIMPLE_FACES = 150
 """Triangles up to which a mesh stays exact: layered thin discs, such as ManiSkill's targets, would lose a layer (see
 `from_afar`)."""

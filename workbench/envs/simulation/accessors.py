@@ -159,14 +159,14 @@ def _setter(stock: Callable[..., None], each: StateProperty) -> Callable[..., No
         else:
             _stock_write(stock, self, value, each.name, chosen)
         if each.group == "targets":
-            return system.wrote_targets(mirror, rows)
+            return system.note_targets(mirror, rows)
         values = mirror.now[at]
 
-        def write_through(whole: NDArray[np.bool_]) -> None:
+        def write_rows(whole: NDArray[np.bool_]) -> None:
             for i, row in zip(chosen[whole].tolist(), values[whole], strict=True):
                 write(self, i, row)
 
-        system.wrote(mirror, at, values, write_through)
+        system.write_through(mirror, at, values, write_rows)
 
     return put
 
@@ -218,7 +218,7 @@ def _target_setter(stock: Callable[..., None], name: str) -> Callable[..., None]
             "drive targets",
             chosen,
         )
-        system.wrote_targets(system.mirror(mirror), rows)
+        system.note_targets(system.mirror(mirror), rows)
 
     return put
 

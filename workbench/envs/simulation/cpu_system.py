@@ -69,7 +69,7 @@ class BatchedCpuSystem:
 
     * A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us) and one gather over all
       envs; a Python getter takes 2 us *per body*.
-    * ManiSkill's setters write through (`wrote`), and its getters return the current state (`refresh`), as on a stock CPU
+    * ManiSkill's setters write through (`write_through`), and its getters return the current state (`refresh`), as on a stock CPU
       env: a task that neither applies nor fetches behaves as on a stock CPU env.
     * An apply writes only numbers that differ from the last fetch and were not written through: a partial
       reset wakes no body of another env.
@@ -314,7 +314,7 @@ class BatchedCpuSystem:
 
     @property
     def laid_out(self) -> bool:
-        """Whether the scene is complete; before that nothing has a row."""
+        """Whether the scene is complete. Before that, bodies have no rows."""
         return self._layout is not None
 
     @property
@@ -552,14 +552,14 @@ class BatchedCpuSystem:
 
     # --- writing: ManiSkill's setters, and gpu_apply_* ------------------------------------------------
 
-    def wrote(
+    def write_through(
         self,
         mirror: Mirror,
         at: tuple[NDArray[np.int64], Any],
         values: NDArray[np.float32],
         write: Callable[[NDArray[np.bool_]], None],
     ) -> None:
-        """Write to the simulation what a setter wrote to a mirror's tensor: `values` at index `at`.
+        """Write `values`, which a setter has written at index `at` of a mirror's tensor, to the simulation too.
 
         Args:
             write: writes through SAPIEN's objects; called with a mask of the rows to write.
@@ -582,7 +582,7 @@ class BatchedCpuSystem:
         at = (at[0][whole], at[1][whole] if isinstance(at[1], np.ndarray) else at[1])
         mirror.now[at] = mirror.seen[at] = values[whole]
 
-    def wrote_targets(self, mirror: DriveTargets, rows: NDArray[np.int64]) -> None:
+    def note_targets(self, mirror: DriveTargets, rows: NDArray[np.int64]) -> None:
         """Note that a setter wrote drive targets of these articulations; they are applied before the next step."""
         mirror.note(rows)
 

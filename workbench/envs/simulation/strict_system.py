@@ -92,7 +92,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     """
 
     rules: BrokenRules
-    """Receives breaches; belongs to the env, so that it outlives a scene."""
+    """Receives the breaches. One object for the env, which keeps it when the scene is built again."""
     hook_of_reset: Place | None = None
     """Where the task defines ``_initialize_episode``."""
 

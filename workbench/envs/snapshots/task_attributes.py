@@ -48,7 +48,7 @@ class TaskValue:
 
 @dataclass
 class Walk:
-    """One walk over everything that a task remembers."""
+    """One walk over all values that a task stores between hooks."""
 
     env: BaseEnv
     author: str

@@ -199,7 +199,7 @@ def ended_text(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> str:
 
 
 def ended_counts(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> list[tuple[str, str, int]]:
-    """For each way to end: its name, its word on the page, and the number of ended episodes of these envs."""
+    """(name, label on the page, number of ended episodes of these envs) for each outcome of an episode."""
     success, fail, all_of_them = (int(n[envs].sum()) for n in (rows.succeeded, rows.failed, rows.ended))
     counts = {
         Outcome.SUCCESS: success,

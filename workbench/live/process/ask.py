@@ -337,7 +337,7 @@ class _Process:
         self._stderr = b""
         """The last bytes of the process's ``stderr``."""
         self._lock = threading.Lock()
-        """Lock for the start: requests made before the start are queued, and sent at the start."""
+        """Guards `_worker`, `_unsent` and `_killed`: requests are queued until the process has started."""
         self._thread = threading.Thread(target=self._run, name="background", daemon=True)
         self._thread.start()
 

@@ -45,7 +45,7 @@ class GuardedTask:
         self.requested_file: Path | None = None
         """The last requested file, loaded or not."""
         self.failed = False
-        """Whether `opened` has failed while it ran; its last call may be half done."""
+        """Whether a call of the code of `opened` has failed. That call may have stopped half-way."""
         self.when_loaded: ProcessState | None = None
         """Process settings at the end of the load of `opened`."""
         self.spoiled = False

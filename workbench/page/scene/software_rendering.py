@@ -62,7 +62,7 @@ class InSoftware:
         """Ask the browsers to report (``browser.js``). Call it in the main panel of each new page."""
         self._server.gui.add_html(render("tell", command=TellDrawnInSoftware(), only="drawn-in-software"))
 
-    def drawn_by_visitor(self, visitor: Visitor) -> None:
+    def report_arrived(self, visitor: Visitor) -> None:
         """Handle the report that a page renders in software."""
         post(partial(self._know, visitor.client.client_id, True))
 

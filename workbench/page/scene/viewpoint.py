@@ -272,7 +272,7 @@ class ViewChoice:
     reverse."""
 
     all_envs: set[str] = field(default_factory=set)
-    """The tasks of which all envs are shown. Of any other task, only the selected env is shown."""
+    """The tasks for which all envs are shown. For all other tasks, only the selected env is shown."""
     frustums: bool = True
     """Whether the cameras are drawn in the view."""
     frames: bool = False
