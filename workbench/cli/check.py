@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.markup import escape
-from rich.progress import MofNCompleteColumn, TimeElapsedColumn
+from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from workbench.actions.choose import needed_by
 from workbench.checks.job import CheckReport, check
@@ -92,84 +92,111 @@ def check_in_terminal(
             run_by(run, "check", chunks, lambda: _job_of(what)) as (executor, _),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar,
         ):
-            row = bar.add_task("opening", total=total)
-            done: set[str] = set()
-            told: set[str] = set()
-            several = False
-
-            def show_count(count: int) -> None:
-                nonlocal several
-                several = True
-                bar.update(row, completed=count, total=items)
-
-            def show(result: RuleResult) -> None:
-                done.add(result.rule)
-                if not several:
-                    bar.update(row, completed=len(done))
-                line = ""
-                if result.state in ("broken", "failed"):
-                    line = f"{result.rule}: {result.state}"
-                elif result.problem is not None:
-                    # One exception of the task may leave most rules undecided: print each reason only once.
-                    line = f"not known: {result.why}"
-                if line and not err.is_terminal and line not in told:
-                    told.add(line)
-                    # In a file or a pipe, the bar is drawn only once, at the end.
-                    err.print(_safe(line), soft_wrap=True)
-
+            shown = _CheckProgress(bar, total, items)
             try:
                 report = check(
                     what,
-                    lambda activity: bar.update(row, description=activity),
-                    show,
+                    shown.show_activity,
+                    shown.show_result,
                     executor=executor,
                     began=began,
-                    on_progress=show_count,
+                    on_progress=shown.show_count,
                 )
             except BaseException:
-                bar.update(row, visible=False)
+                shown.hide()
                 raise
-            if not several:
-                bar.update(row, completed=len(report.results))
-            bar.update(row, description="checked")
+            shown.finish(len(report.results))
     except TaskError as error:
         print_problem(error.problem)
-        said = _without_result(what, output, root, error.problem, began)
+        reported = _without_result(what, output, root, error.problem, began)
     except PoolError as error:
         refuse(str(error))
-        said = _without_result(what, output, root, Problem("worker", str(error), None, None, None, ""), began)
+        reported = _without_result(
+            what, output, root, Problem("worker", str(error), None, None, None, ""), began
+        )
     except (OSError, ValueError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
         print_part(run, "check", stopped=True)
         return interrupted()
     else:
-        said = Reported(report, what, root, output.fail_on)
+        reported = Reported(report, what, root, output.fail_on)
     try:
         with here.again():
-            write_reports(said, output)
+            write_reports(reported, output)
     except OSError as error:
         return refuse(str(error))
     if output.json:
-        print(as_json(said), end="", flush=True)
-    elif said.error is None:
-        print_report(said)
+        print(as_json(reported), end="", flush=True)
+    elif reported.error is None:
+        print_report(reported)
         print_part(run, "check", stopped=False)
-    return exit_code(said)
+    return exit_code(reported)
 
 
-def write_reports(said: Reported, output: CheckOutput) -> None:
+class _CheckProgress:
+    """The progress of a check: a bar, and lines about rules that are broken or not known where the bar is not
+    drawn (a file or a pipe).
+
+    Args:
+        total: number of rules.
+        items: number of work items, if the check reports how many are done (`show_count`).
+    """
+
+    def __init__(self, bar: Progress, total: int, items: int) -> None:
+        self._bar, self._items = bar, items
+        self._row = bar.add_task("opening", total=total)
+        self._done: set[str] = set()
+        self._printed: set[str] = set()
+        self._counts_items = False
+        """Whether the bar counts work items, not rules."""
+
+    def show_activity(self, activity: str) -> None:
+        self._bar.update(self._row, description=activity)
+
+    def show_count(self, count: int) -> None:
+        """Show the number of work items that are done."""
+        self._counts_items = True
+        self._bar.update(self._row, completed=count, total=self._items)
+
+    def show_result(self, result: RuleResult) -> None:
+        self._done.add(result.rule)
+        if not self._counts_items:
+            self._bar.update(self._row, completed=len(self._done))
+        line = ""
+        if result.state in ("broken", "failed"):
+            line = f"{result.rule}: {result.state}"
+        elif result.problem is not None:
+            # One exception of the task may leave most rules undecided: print each reason only once.
+            line = f"not known: {result.why}"
+        if line and not err.is_terminal and line not in self._printed:
+            self._printed.add(line)
+            # In a file or a pipe, the bar is drawn only once, at the end.
+            err.print(_safe(line), soft_wrap=True)
+
+    def hide(self) -> None:
+        """Remove the bar, because the check has failed."""
+        self._bar.update(self._row, visible=False)
+
+    def finish(self, rules: int) -> None:
+        """Show that the check is done, for this number of rules."""
+        if not self._counts_items:
+            self._bar.update(self._row, completed=rules)
+        self._bar.update(self._row, description="checked")
+
+
+def write_reports(reported: Reported, output: CheckOutput) -> None:
     """Write the requested files. Raises OSError."""
     for path, made in ((output.json_file, as_json), (output.junit, as_junit), (output.sarif, as_sarif)):
         if path is not None:
-            replace_file(path, made(said).encode())
+            replace_file(path, made(reported).encode())
 
 
-def exit_code(said: Reported) -> int:
+def exit_code(reported: Reported) -> int:
     """Exit code of a check: 2 if nothing was checked, 1 if the check fails (`CheckReport.fails`), else 0."""
-    if said.error is not None:
+    if reported.error is not None:
         return Exit.REFUSED
-    return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE
+    return Exit.FAILED if reported.report.fails(reported.fail_on) else Exit.DONE
 
 
 def _job_of(what: CheckOptions) -> JobKey:
@@ -190,17 +217,17 @@ def _without_result(
 # --- text ------------------------------------------------------------------------------------------------
 
 
-def print_report(said: Reported) -> None:
+def print_report(reported: Reported) -> None:
     """Print the findings, and a summary."""
-    report = said.report
+    report = reported.report
     findings = report.findings
     for degree, style in (("stop", "red"), ("warn", "yellow")):
         of_degree = [finding for finding in findings if finding.degree == degree]
         if of_degree:
             _print(f"[bold {style}]{degree}[/]: {count_text(len(of_degree), 'finding')}\n")
         for finding in of_degree:
-            _print_finding(finding, said.root, style)
-    _print_summary(report, said.root)
+            _print_finding(finding, reported.root, style)
+    _print_summary(report, reported.root)
     for notice in report.task.notices:
         warn(notice)
     if report.task.others:

@@ -79,16 +79,16 @@ def repository_of(folder: Path) -> Path:
 # --- JSON ------------------------------------------------------------------------------------------------
 
 
-def as_json(said: Reported) -> str:
+def as_json(reported: Reported) -> str:
     """The whole report as one JSON object."""
-    report, what = said.report, said.what
+    report, what = reported.report, reported.what
     task = report.task
     return json_text(
         {
             "task": {
                 "id": task.env_id,
                 "class": task.class_name,
-                "file": None if task.file is None else shown_path(task.file, said.root),
+                "file": None if task.file is None else shown_path(task.file, reported.root),
                 "not_checked": list(task.others),
             },
             "num_envs": what.options.num_envs,
@@ -98,23 +98,23 @@ def as_json(said: Reported) -> str:
             "seconds": round(report.seconds, 3),
             "start_seconds": round(report.start_seconds, 3),
             "picture_seconds": round(report.picture_seconds, 3),
-            "fail_on": said.fail_on,
-            "fails": said.error is not None or report.fails(said.fail_on),
-            "error": _error(said),
+            "fail_on": reported.fail_on,
+            "fails": reported.error is not None or report.fails(reported.fail_on),
+            "error": _error(reported),
             "counts": dict(Counter(result.state for result in report.results)),
-            "findings": [_finding(finding, said.root) for finding in report.findings],
-            "rules": [_rule(result, said.root) for result in report.results],
+            "findings": [_finding(finding, reported.root) for finding in report.findings],
+            "rules": [_rule(result, reported.root) for result in report.results],
             "ignored": list(report.ignored),
             "comments": [
-                {"file": shown_path(one.file, said.root), "line": one.line, "message": one.message}
+                {"file": shown_path(one.file, reported.root), "line": one.line, "message": one.message}
                 for one in report.comments
             ],
         }
     )
 
 
-def _error(said: Reported) -> dict[str, Any] | None:
-    return None if said.error is None else _problem(said.error, said.root)
+def _error(reported: Reported) -> dict[str, Any] | None:
+    return None if reported.error is None else _problem(reported.error, reported.root)
 
 
 def _problem(problem: Problem, root: Path) -> dict[str, Any]:
@@ -167,14 +167,14 @@ def json_text(value: Any) -> str:
 # --- JUnit -----------------------------------------------------------------------------------------------
 
 
-def as_junit(said: Reported) -> str:
+def as_junit(reported: Reported) -> str:
     """JUnit XML with a test case for each rule, in pytest's format, which GitLab, Jenkins and GitHub Actions
     read. A finding whose degree is below ``--fail-on`` appears as output of a passing test."""
-    report = said.report
-    root = repository_of(said.root)
-    cases = [_case(result, said, root) for result in report.results]
+    report = reported.report
+    root = repository_of(reported.root)
+    cases = [_case(result, reported, root) for result in report.results]
     cases += [_ignored_case(rule, report.task.env_id) for rule in report.ignored]
-    cases += [] if said.error is None else [_error_case(said, said.error, root)]
+    cases += [] if reported.error is None else [_error_case(reported, reported.error, root)]
     counts = {
         "tests": len(cases),
         "failures": sum(case.find("failure") is not None for case in cases),
@@ -194,9 +194,9 @@ def as_junit(said: Reported) -> str:
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element:
+def _case(result: RuleResult, reported: Reported, root: Path) -> ElementTree.Element:
     """Test case of a rule that was checked."""
-    task = said.report.task
+    task = reported.report.task
     place = next((f for f in result.findings if f.file is not None), None)
     file = task.file if place is None else place.file
     case = _test_case(task.env_id, result.rule, result.seconds)
@@ -204,7 +204,7 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
         case.set("file", xml_text(shown_path(file, root)))
         if place is not None and place.line is not None:
             case.set("line", str(place.line))
-    failing = [finding for finding in result.findings if said.fails(finding)]
+    failing = [finding for finding in result.findings if reported.fails(finding)]
     if failing:
         failure = ElementTree.SubElement(
             case, "failure", type=result.rule, message=xml_text(failing[0].message)
@@ -212,7 +212,7 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
         failure.text = xml_text("\n\n".join(_text(finding, root) for finding in failing))
     elif result.state in ("failed", "not_known", "not_applicable"):
         message = xml_text(f"{state_text(result.state)}: {result.why}")
-        if result.problem is None or said.fail_on == "never":
+        if result.problem is None or reported.fail_on == "never":
             kind = f"workbench.{result.state}"
             ElementTree.SubElement(case, "skipped", type=kind, message=message)
         else:
@@ -220,7 +220,7 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
             error = ElementTree.SubElement(case, "error", type=kind, message=message)
             trace = result.problem.traceback
             error.text = xml_text(f"{REPORT_IT}\n\n{trace}" if result.is_crash else result.why)
-    lines = [_text(finding, root) for finding in result.findings if not said.fails(finding)]
+    lines = [_text(finding, root) for finding in result.findings if not reported.fails(finding)]
     lines += [f"silenced: {_text(one.finding, root)}\nreason: {one.reason}" for one in result.silenced]
     lines += result.notes
     if lines:
@@ -234,10 +234,10 @@ def _ignored_case(rule: str, env_id: str) -> ElementTree.Element:
     return case
 
 
-def _error_case(said: Reported, error: Problem, root: Path) -> ElementTree.Element:
-    case = _test_case(said.report.task.env_id, CANNOT_CHECK, said.report.seconds)
+def _error_case(reported: Reported, error: Problem, root: Path) -> ElementTree.Element:
+    case = _test_case(reported.report.task.env_id, CANNOT_CHECK, reported.report.seconds)
     where = ""
-    if (place := said.place_of_error) is not None:
+    if (place := reported.place_of_error) is not None:
         file, line = shown_path(place[0], root), place[1]
         case.set("file", xml_text(file))
         if line is not None:
@@ -269,17 +269,17 @@ def xml_text(text: str) -> str:
 # --- SARIF -----------------------------------------------------------------------------------------------
 
 
-def as_sarif(said: Reported) -> str:
+def as_sarif(reported: Reported) -> str:
     """SARIF 2.1.0 with the fields that GitHub code scanning requires. Paths are relative to the repository."""
-    report = said.report
-    root = repository_of(said.root)
+    report = reported.report
+    root = repository_of(reported.root)
     ids = [*(result.rule for result in report.results), *report.ignored]
     rules = [_sarif_rule(rule) for rule in ids]
     silenced = [(one.finding, one.reason) for result in report.results for one in result.silenced]
-    results = [_result(finding, ids, said, root) for finding in report.findings]
+    results = [_result(finding, ids, reported, root) for finding in report.findings]
     results += [
         {
-            **_result(finding, ids, said, root),
+            **_result(finding, ids, reported, root),
             "suppressions": [{"kind": "inSource", "justification": reason}],
         }
         for finding, reason in silenced
@@ -302,8 +302,8 @@ def as_sarif(said: Reported) -> str:
         }
         for comment in report.comments
     ]
-    if said.error is not None:
-        results.append(_error_result(said, said.error, root))
+    if reported.error is not None:
+        results.append(_error_result(reported, reported.error, root))
         rules.append(_ERROR_RULE)
     off = [
         {"descriptor": {"id": rule, "index": ids.index(rule)}, "configuration": {"enabled": False}}
@@ -314,7 +314,7 @@ def as_sarif(said: Reported) -> str:
         "semanticVersion": version(DISTRIBUTION),
         "rules": rules,
     }
-    ran = said.error is None and not report.stopped and all(one.problem is None for one in report.results)
+    ran = reported.error is None and not report.stopped and all(one.problem is None for one in report.results)
     run = {
         "tool": {"driver": driver},
         "originalUriBaseIds": {"%SRCROOT%": {"uri": f"{root.as_uri()}/"}},
@@ -340,8 +340,8 @@ _ERROR_RULE = {
 }
 
 
-def _error_result(said: Reported, error: Problem, root: Path) -> dict[str, Any]:
-    place = said.place_of_error
+def _error_result(reported: Reported, error: Problem, root: Path) -> dict[str, Any]:
+    place = reported.place_of_error
     key = [CANNOT_CHECK, shown_path(place[0] if place else "", root), error.code or ""]
     return {
         "ruleId": CANNOT_CHECK,
@@ -370,9 +370,9 @@ def _sarif_rule(rule_id: str) -> dict[str, Any]:
     }
 
 
-def _result(finding: Finding, ids: list[str], said: Reported, root: Path) -> dict[str, Any]:
+def _result(finding: Finding, ids: list[str], reported: Reported, root: Path) -> dict[str, Any]:
     # Code scanning shows no result without a place: fall back to the first line of the task's file.
-    file = finding.file or said.report.task.file
+    file = finding.file or reported.report.task.file
     key = [finding.rule, shown_path(file or "", root), finding.function, finding.code]
     return {
         "ruleId": finding.rule,

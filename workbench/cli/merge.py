@@ -181,10 +181,12 @@ def _with_missing(code: int, missing: int, what: str, names: Iterable[str] = ())
 def _print_check(merged: JobParts, output: MergeOutput) -> int:
     what = merged.requested(CheckOptions)
     report = check_report_of(what, merged.results(ItemOutcome))
-    said = Reported(report, what, Path.cwd(), output.fail_on)
-    write_check_reports(said, CheckOutput(json_file=output.json_file, junit=output.junit, sarif=output.sarif))
-    print_check(said)
-    return _with_missing(exit_code(said), report.missing, "results of rules")
+    reported = Reported(report, what, Path.cwd(), output.fail_on)
+    write_check_reports(
+        reported, CheckOutput(json_file=output.json_file, junit=output.junit, sarif=output.sarif)
+    )
+    print_check(reported)
+    return _with_missing(exit_code(reported), report.missing, "results of rules")
 
 
 def _print_rescore(merged: JobParts, output: MergeOutput) -> int:

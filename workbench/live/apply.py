@@ -219,11 +219,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case OptionsApplied(options=options):
             return apply_options(run, options)
         case FileOpened():
-            file = event.file
-            opened = replace(
-                run, reference=f"{file}:{event.class_name}", own_file=file, own_folder=file.parent, choices=()
-            )
-            return reload_file(opened, "auto", follow(opened, ()))
+            return _open_file(run, event)
         case MomentShown(serial=serial, env=env):
             run, effects = (run, []) if env is None else _change_settings(run, selected_env=env)
             return _show(run, None if run.past is None else run.past.seek(serial)), effects
@@ -236,10 +232,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case PastPicturesWanted(at=at):
             return _draw_past(run) if at == run.stands_at else (run, [])
         case SlidersMoved():
-            if run.task is None:
-                return run, []
-            envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx
-            return _show_live(run), [Send(SetSliderAction(envs, event.dimensions, event.values))]
+            return _move_sliders(run, event)
         case ReadingChosen(sections=sections, body=body):
             return replace(run, read_sections=sections, read_body=body), []
         case ReadingDue():
@@ -249,6 +242,21 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case RunToEnter():
             return _enter(run, event)
     return run, []
+
+
+def _open_file(run: Run, event: FileOpened) -> Change:
+    file = event.file
+    opened = replace(
+        run, reference=f"{file}:{event.class_name}", own_file=file, own_folder=file.parent, choices=()
+    )
+    return reload_file(opened, "auto", follow(opened, ()))
+
+
+def _move_sliders(run: Run, event: SlidersMoved) -> Change:
+    if run.task is None:
+        return run, []
+    envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx
+    return _show_live(run), [Send(SetSliderAction(envs, event.dimensions, event.values))]
 
 
 # --- commands ----------------------------------------------------------------------------------------

@@ -81,50 +81,10 @@ def export_maniskill(
             raise FileExistsError(f"{path} exists already; give a file that does not exist yet.")
     made = Demonstrations(file)
     parts = [file.parent / f".{file.stem}.{uuid.uuid4().hex[:8]}{suffix}" for suffix in (".json", ".h5")]
-    document: dict[str, Any] | None = None
-    first: dict[str, Any] = {}
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with h5py.File(parts[1], "x") as written:
-            for number, (name, read) in enumerate(sources):
-                on_progress(number, name)
-                try:
-                    episode = read_whole(name, read)
-                    if episode.length == 0:
-                        raise OtherDemonstration(f"{name}: it has no step")
-                    shape = _shape(episode)
-                    if document is not None and (other := _difference(first, shape)):
-                        raise OtherDemonstration(f"{name}: {other}")
-                except (OtherDemonstration, UnreadableRecording) as error:
-                    if not only_fitting:
-                        raise
-                    made.not_fitting.append(str(error))
-                    continue
-                success = episode.flags.get("success")
-                if only_successes and (success is None or not success.any()):
-                    made.left_out += 1
-                    continue
-                entry = maniskill_json(episode)
-                if document is None:
-                    document, first = {**entry, "episodes": []}, shape
-                trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
-                put_columns(_flat(episode), trajectory)
-                put_pictures(episode, trajectory)
-                # An episode without a scene is from a file of ManiSkill, which keeps pictures without loss.
-                made.lossy |= episode.geometry is not None and any(
-                    "rgb" in m for m in shape["pictures"].values()
-                )
-                if missing := missing_pictures(episode):
-                    made.incomplete.append(f"{name}: the recording lacks some observations: {missing}.")
-                document["episodes"].append(
-                    {
-                        **entry["episodes"][0],
-                        "episode_id": made.episodes,
-                        WORKBENCH_ID: episode.info.id,
-                        **seen_otherwise(episode.info),
-                    }
-                )
-                made.episodes, made.steps = made.episodes + 1, made.steps + episode.length
+            document = _write_episodes(sources, written, made, only_successes, only_fitting, on_progress)
         if document is None:
             raise ValueError("\n".join(made.not_fitting) or "There is no episode to write.")
         with parts[0].open("x") as described:
@@ -140,6 +100,74 @@ def export_maniskill(
             part.unlink(missing_ok=True)
     on_progress(len(sources), "done")
     return made
+
+
+def _write_episodes(
+    sources: Sequence[tuple[str, Callable[[], Episode]]],
+    written: h5py.File,
+    made: Demonstrations,
+    only_successes: bool,
+    only_fitting: bool,
+    on_progress: Callable[[int, str], None],
+) -> dict[str, Any] | None:
+    """Write each episode into a group of `written`, and count the episodes in `made`; returns the content of
+    the ``.json``, or None if no episode was written. See `export_maniskill`."""
+    document: dict[str, Any] | None = None
+    first: dict[str, Any] | None = None
+    for number, (name, read) in enumerate(sources):
+        on_progress(number, name)
+        try:
+            episode, shape = _read_fitting(name, read, first)
+        except (OtherDemonstration, UnreadableRecording) as error:
+            if not only_fitting:
+                raise
+            made.not_fitting.append(str(error))
+            continue
+        success = episode.flags.get("success")
+        if only_successes and (success is None or not success.any()):
+            made.left_out += 1
+            continue
+        entry = maniskill_json(episode)
+        if document is None:
+            document, first = {**entry, "episodes": []}, shape
+        trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
+        put_columns(_flat(episode), trajectory)
+        put_pictures(episode, trajectory)
+        # An episode without a scene is from a file of ManiSkill, which keeps pictures without loss.
+        made.lossy |= episode.geometry is not None and any("rgb" in m for m in shape["pictures"].values())
+        if missing := missing_pictures(episode):
+            made.incomplete.append(f"{name}: the recording lacks some observations: {missing}.")
+        document["episodes"].append(
+            {
+                **entry["episodes"][0],
+                "episode_id": made.episodes,
+                WORKBENCH_ID: episode.info.id,
+                **seen_otherwise(episode.info),
+            }
+        )
+        made.episodes, made.steps = made.episodes + 1, made.steps + episode.length
+    return document
+
+
+def _read_fitting(
+    name: str, read: Callable[[], Episode], first: dict[str, Any] | None
+) -> tuple[Episode, dict[str, Any]]:
+    """Read an episode; returns it with its `_shape`.
+
+    Args:
+        first: `_shape` of the first episode of the file; None if this is the first one.
+
+    Raises:
+        UnreadableRecording: the episode cannot be read completely.
+        OtherDemonstration: the episode has no step, or differs from the first one.
+    """
+    episode = read_whole(name, read)
+    if episode.length == 0:
+        raise OtherDemonstration(f"{name}: it has no step")
+    shape = _shape(episode)
+    if first is not None and (other := _difference(first, shape)):
+        raise OtherDemonstration(f"{name}: {other}")
+    return episode, shape
 
 
 def _shape(episode: Episode) -> dict[str, Any]:
