@@ -68,4 +68,4 @@ def test_findings_of_the_previous_version_come_last_and_are_counted() -> None:
         ("reward-changes", False),
         ("success-at-reset", True),
     ]
-    assert count(shown) == 2 and summary(view, shown) == "1 warn, 1 of the version before"
+    assert count(shown) == 2 and summary(view, shown) == "1 warn, 1 of the previous version"

@@ -264,4 +264,4 @@ def test_each_seed_has_a_row_that_opens_its_recording_and_verdicts_are_cards(ser
     third = replace(REPORT.seeds[0], seed=2)
     report = replace(REPORT, wanted=9, seeds=(*REPORT.seeds, third))
     live.show(running(1, seeds=SeedsView("stopped", 5, report, total=9, stale=True)))
-    assert "3 of 9 seeds" in live.html() and "of the version before" in live.html()
+    assert "3 of 9 seeds" in live.html() and "of the previous version" in live.html()

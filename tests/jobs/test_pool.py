@@ -114,7 +114,7 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
         fails("no UTF-8", r"there is no .*caf\\udce9"),
         fails("garbage", "a process that squares sent an unreadable message"),
         fails("another type", "a process that squares sent an unreadable message"),
-        fails("another's", "a process that squares sent the result of an item that it does not have"),
+        fails("another's", "a process that squares sent the result of an item that it was not given"),
     ],
 )
 def test_a_failing_process_ends_the_job_and_the_others_finish_their_started_items(
@@ -229,7 +229,7 @@ def test_a_chunk_of_a_dead_worker_is_dealt_again_last_without_its_finished_items
     later = [probe.scheduler.next("b") for _ in range(3)]
     assert [chunk and chunk.numbers for chunk in later] == [(2, 3), (4, 5), (0, 1)]
     assert later[2] == Chunk((0, 1), frozenset({0}), again=True)
-    with pytest.raises(PoolError, match="that it does not have"):
+    with pytest.raises(PoolError, match="that it was not given"):
         probe.scheduler.result("b", 1, 1)
 
 

@@ -240,7 +240,7 @@ def test_the_memory_of_open_recordings_is_limited() -> None:
     review.open([f"e{i}" for i in range(6)])
     view = reach(review, lambda v: bool(v.problems) and not v.loading, "the word for it")
     assert len(view.opened) == 2 == len(held)
-    assert "and 3 more were not opened: the recordings before take 100 MB" in view.problems[0]
+    assert "and 3 more were not opened: the recordings opened before take 100 MB" in view.problems[0]
     review.close()
 
 

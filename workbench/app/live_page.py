@@ -113,7 +113,7 @@ PANELS_PERIOD_SECONDS = 0.06
 cannot be read."""
 PICTURES_HINT = (
     "Exact pictures are SAPIEN's own. Fast pictures show simplified meshes and take a fraction of the time without a graphics "
-    "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
+    "card. Auto: fast while something moves, exact when nothing moves. This page records exact pictures only."
 )
 PANEL_WIDTH_PIXELS = 372
 RUN, ENVS_TAB, REWARD, LOG, ALL_PICTURES = "Run", "Envs", "Reward", "Log", "All pictures"
@@ -407,11 +407,11 @@ class Page:
         return None
 
     def _open_file(self, file: str, visitor: Visitor) -> None:
-        """Open a file in the user's editor. Raises `Refused` if no editor is set, or the file is no file of
+        """Open a file in the user's editor. Raises `Refused` if no editor is set, or the file is not a file of
         the task."""
         link = self._link(file, None)
         if not link.address:
-            raise Refused(f"No editor opens {file}: it is no file of the task, or --editor is none.")
+            raise Refused(f"No editor opens {file}: it is not a file of the task, or --editor is none.")
         visitor.send(render("open_address", link=link))
 
     def _unfolded(self, panel: str) -> None:

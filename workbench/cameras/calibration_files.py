@@ -132,7 +132,7 @@ def cameras_as_opencv_yaml(cameras: Sequence[CameraToExport]) -> str:
         s, pose = camera.settings, camera.pose_in_env
         lines += [f"{key}:", f"   image_width: {s.width}", f"   image_height: {s.height}"]
         if camera.mount:
-            lines += [f"   # Mounted on {_one_line(camera.mount)}: the camera's pose is that of one moment."]
+            lines += [f"   # Mounted on {_one_line(camera.mount)}: the pose holds for one moment only."]
         lines += _opencv_matrix("camera_matrix", intrinsic_of(s))
         lines += _opencv_matrix("distortion_coefficients", np.zeros((1, 5)))
         lines += ["   # World to camera: x right, y down, z forward."]

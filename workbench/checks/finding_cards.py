@@ -133,7 +133,7 @@ def summary(checks: ChecksView, shown: list[Card]) -> str:
     counted = (
         *((by_degree[degree], degree) for degree in DEGREES),
         *((states[state], state_text(state)) for state in _SUMMED),
-        (old, "of the version before"),
+        (old, "of the previous version"),
     )
     return ", ".join(f"{number} {what}" for number, what in counted if number)
 

@@ -75,7 +75,7 @@ class RuleResult:
     findings: tuple[Finding, ...] = ()
     silenced: tuple[Silenced, ...] = ()
     notes: tuple[str, ...] = ()
-    """Notes that are no breach."""
+    """Notes that are not breaches."""
     why: str = ""
     """The reason why the rule is not known, not applicable or failed; for a broken rule, why its check
     was not completed."""

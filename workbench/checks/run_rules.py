@@ -108,7 +108,7 @@ def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, 
         result = _checked(rule, check, checkup, degrees[rule], rows)
         error = result.problem
         if error is not None and error.stage != "policy" and degrees["runs"] != "off":
-            # An error of a policy is no fault of the task.
+            # An error of a policy is not a fault of the task.
             if not _is_known(error, checkup, degrees):
                 cause = result_of("runs", degrees["runs"], [raised(error, checkup)])
                 result, further = (cause, []) if rule == "runs" else (result, [cause])

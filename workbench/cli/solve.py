@@ -243,7 +243,7 @@ def as_csv(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
 def as_junit(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
     """JUnit XML with a test case for each broken rule of `planning.verdicts` and for each seed. The case of a
     rule fails if the rule's degree makes the command fail. The case of an unsolved seed is skipped: one
-    unsolved seed is no fault of the task."""
+    unsolved seed is not a fault of the task."""
     cases = [_case(what, f"seed {one.seed}", one.seconds) for one in report.seeds]
     for case, one in zip(cases, report.seeds, strict=True):
         if not one.solved_at:

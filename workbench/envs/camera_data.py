@@ -147,7 +147,7 @@ def why_no_camera(settings: CameraSettings) -> str | None:
     ):
         return f"width and height must be 1 to {MAX_SIDE_PIXELS}, not {settings.width} x {settings.height}"
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,60}", settings.shader_pack):
-        return f"{settings.shader_pack!r} is no shader pack"
+        return f"{settings.shader_pack!r} is not a shader pack"
     if (settings.fov is None) == (settings.intrinsic is None):
         return "a camera has either a fov or an intrinsic matrix"
     if settings.fov is not None and not 0.0 < settings.fov < math.pi:

@@ -70,7 +70,7 @@ def degrees_of(choice: Degree | None) -> dict[str, Degree]:
     """The degree of each rule: `choice` for all rules; if it is None, each rule's default.
 
     Raises:
-        ValueError: `choice` is no degree.
+        ValueError: `choice` is not a degree.
     """
     if choice is not None and choice not in DEGREES:
         raise ValueError(f"rules must be 'stop', 'warn' or 'off', not {choice!r}")
@@ -273,7 +273,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             A physics step moves all envs at once: a GPU cannot step some of them. An env that is in the
             middle of its episode gets a step that its policy did not choose, and its count of steps does not
             include it. On the CPU each env has its own physics, and only the envs that are being reset are
-            stepped. The habit comes from tasks with one env, where it is no mistake.
+            stepped. The habit comes from tasks with one env, where it is not a mistake.
 
             ## Mend
             Compute the settled pose and place the bodies there, slightly above the surface that carries them.
@@ -508,7 +508,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "step",
             """A task moves links by the qpos and the root pose of their articulation.
 
-            Physics never sees the pose of a link; pictures do.
+            The simulation ignores a link's pose; pictures do not.
 
             ## Why
             A link's pose follows from the qpos and the root pose of its articulation. The GPU has no way to
@@ -527,7 +527,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
 
             ## How it is checked
             {watched}
-            At each fetch it compares the poses of links that are no roots with what the simulation has.
+            At each fetch it compares the poses of links that are not roots with what the simulation has.
             """,
         ),
         _gpu_rule(
@@ -589,7 +589,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
 
             ## How it is checked
             {watched}
-            It watches reads of links after a qpos or a root pose was set. A read of the root is no breach,
+            It watches reads of links after a qpos or a root pose was set. A read of the root is not a breach,
             since the root pose is always up to date.
             """,
         ),

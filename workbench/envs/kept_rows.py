@@ -40,7 +40,7 @@ class KeptRows:
     A partial reset must change only the rows of ``env_idx``, in the task's tensors, arrays, lists and Poses,
     and in those inside its dicts and own objects. Nothing raises if other rows change: ``self.target =
     torch.rand((self.num_envs, 2))`` gives every env another target in the middle of its episode. Values are
-    compared, so a value computed again with the same result is no fault.
+    compared, so a value computed again with the same result is not a fault.
 
     Args:
         env: an env in the middle of an episode.

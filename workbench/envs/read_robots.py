@@ -104,7 +104,7 @@ def _keyframes(agent: Any) -> Iterator[RobotKeyframe]:
 
 
 def _root_pose(pose: Any) -> Pose | None:
-    """The pose of a keyframe, of the first env if it has one for each; None if it is no pose."""
+    """The pose of a keyframe, of the first env if it has one for each; None if it is not a pose."""
     row = ManiSkillPose.create(pose).raw_pose[0].double().cpu()
     if not row.isfinite().all() or row[3:].norm() == 0:
         return None

@@ -191,7 +191,7 @@ class StrictMixin:
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
-            # `evaluate` may store values for all envs, which is no mistake: compare only later changes.
+            # `evaluate` may store values for all envs, which is not a mistake: compare only later changes.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
 

@@ -208,7 +208,7 @@ class Episode:
     """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
     obs: dict[str, NDArray] = field(default_factory=dict)
     """State observations without pictures, (T + 1, ...) each; nested keys are joined by ``/``; an observation
-    that is no dict has the key ``""``."""
+    that is not a dict has the key ``""``."""
     batch: dict[str, NDArray] = field(default_factory=dict)
     """(T + 1, ...) numbers that ``evaluate()`` returned for the whole batch."""
     texts: dict[str, TextTrack] = field(default_factory=dict)

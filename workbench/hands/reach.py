@@ -1,4 +1,4 @@
-"""Arms that a person leads by the handles at their end effectors."""
+"""Arms that follow the handles at their end effectors, which a person drags."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ArmDragged:
 
 @dataclass(frozen=True)
 class ArmsReleased:
-    """A drag was cancelled, for example because its page has closed: no arm is led any more."""
+    """A drag was cancelled, for example because its page has closed: no arm follows its handle any more."""
 
 
 @dataclass(frozen=True)

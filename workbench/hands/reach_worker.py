@@ -78,7 +78,7 @@ class LedArms:
         self._send(_reached(task.env, arm, request, goal, with_links=True))
 
     def lead(self, task: TaskEnv, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (N, A) with the numbers of the led arms set; `action` itself is not changed."""
+        """The action (N, A) with the numbers set for the arms that follow handles; `action` itself is not changed."""
         if not self._targets:
             return action
         action = action.copy()

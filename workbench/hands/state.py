@@ -109,7 +109,7 @@ class DraggedJoint:
 
 @dataclass(frozen=True)
 class Hands:
-    """What a person drives, leads and drags, and the last kept episode. Also the view of this feature."""
+    """What a person drives and drags by hand, and the last kept episode. Also the view of this feature."""
 
     driving: bool = False
     source: ActionSource = "random"
@@ -127,7 +127,7 @@ class Hands:
     closes: bool = False
     """Whether the gripper closes."""
     reach: Reach = Reach()
-    """Arms that are led by their handles."""
+    """Arms that follow their handles."""
     all_envs: bool = False
     """Whether a move applies to all envs; if False, to the selected one."""
     dragged: DraggedJoint | None = None
@@ -438,7 +438,7 @@ def _require_live(run: Run) -> None:
 def _require_pose(pose: tuple[float, ...]) -> None:
     """A page may report any numbers, and numbers that are not finite would spread to the whole simulation."""
     if not all(map(math.isfinite, pose)) or not any(pose[3:]):
-        raise Refused("This is no pose: it needs finite numbers, and a quaternion that is not zero.")
+        raise Refused("This is not a pose: it needs finite numbers, and a quaternion that is not zero.")
 
 
 def envs_of_move(hands: Hands, env: int, num_envs: int) -> tuple[int, ...]:

@@ -243,7 +243,7 @@ class Scheduler(Generic[Result, Update]):
         """Take the result of an item. Raises PoolError if the worker does not have this item."""
         held = next((held for held in self._held.get(worker, ()) if number in held.missing), None)
         if held is None:
-            raise PoolError("sent the result of an item that it does not have")
+            raise PoolError("sent the result of an item that it was not given")
         held.missing.remove(number)
         if not held.missing:
             self._held[worker].remove(held)

@@ -69,7 +69,7 @@ def normalised(quaternion: ArrayLike) -> Floats:
     # Divide by the largest first: the squares of tiny numbers underflow to zero.
     largest = np.abs(q).max()
     if largest == 0:
-        raise ValueError("a quaternion of zeros is no rotation; 1, 0, 0, 0 (w first) is the identity")
+        raise ValueError("a quaternion of zeros is not a rotation; 1, 0, 0, 0 (w first) is the identity")
     q = q / largest
     q = q / np.linalg.norm(q)
     first = q[np.abs(q) > 1e-12][0]
@@ -104,21 +104,21 @@ def nearest_rotation(matrix: ArrayLike) -> Floats:
         raise ValueError("the rotation holds numbers that are not finite")
     u, scales, v = np.linalg.svd(m)
     if scales[2] < 1e-6:
-        raise ValueError("the matrix is no rotation: it flattens space (its determinant is 0)")
+        raise ValueError("the matrix is not a rotation: its determinant is 0")
     if np.linalg.det(m) < 0:
         raise ValueError(
-            "the matrix is no rotation but a mirror image (its determinant is negative): one axis, or the whole "
+            "the matrix is not a rotation but a mirror image (its determinant is negative): one axis, or the whole "
             "of a row or column, has the wrong sign"
         )
     if scales[0] - scales[2] <= ROTATION_TOLERANCE * scales[0] and abs(scales[0] - 1) > ROTATION_TOLERANCE:
         raise ValueError(
-            f"the matrix is no rotation: it also scales by {scales.mean():.4g}. Divide its 3 x 3 part by "
+            f"the matrix is not a rotation: it also scales by {scales.mean():.4g}. Divide its 3 x 3 part by "
             "this number, and check that the translation is in metres"
         )
     if np.abs(scales - 1).max() > ROTATION_TOLERANCE:
         lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(m, axis=1))
         raise ValueError(
-            f"the matrix is no rotation: its rows must be of length 1 and at right angles to each other; their "
+            f"the matrix is not a rotation: its rows must be of length 1 and at right angles to each other; their "
             f"lengths are {lengths}"
         )
     return u @ v

@@ -158,7 +158,7 @@ class RolloutPlanner:
             ValueError: the number of envs differs from the number of rollouts.
         """
         if env.num_envs != options.rollouts:
-            raise ValueError(f"{options.rollouts} rollouts need as many envs, not {env.num_envs}")
+            raise ValueError(f"{options.rollouts} rollouts need {options.rollouts} envs, not {env.num_envs}")
         self.env, self._options, self._exact = env, options, exact
         self._parts = actions.action_parts(env)
         self.horizon = options.steps(env.control_timestep, "success" in env.get_info())

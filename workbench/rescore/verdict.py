@@ -142,7 +142,7 @@ def compare(
         was[row, :length], now[row, :length] = old.evaluate[name][:length], new.evaluate[name]
     apart = gap(was, now)
     differs = too_far(was, apart, axis=1)
-    # A missing first value is no difference: many files lack values for the first state of a run.
+    # A missing first value is not a difference: many files lack values for the first state of a run.
     differs[:, 0] &= ~np.isnan(was[:, 0])
     others = {name: differs[row].nonzero()[0] for row, name in enumerate(names)}
     turned: dict[str, tuple[int | None, int | None]] = {}

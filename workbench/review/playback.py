@@ -213,7 +213,7 @@ class Review:
                 left = len(rows) - done
                 problem = (
                     f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: "
-                    f"the recordings before take {format_size(self._most_bytes)} of memory. Open fewer at "
+                    f"the recordings opened before take {format_size(self._most_bytes)} of memory. Open fewer at "
                     "once."
                 )
                 break

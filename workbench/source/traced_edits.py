@@ -234,7 +234,7 @@ def matrix_text(rows: Sequence[Sequence[float]]) -> str:
 def quaternion_texts(quaternion: Sequence[float]) -> list[str]:
     """The numbers of the normalised `quaternion` (wxyz) as text, with as few decimals as are exact to 1e-7.
 
-    SAPIEN does not normalise: with 0.7071 in place of 0.7071068, the camera's frame is no rotation.
+    SAPIEN does not normalise: with 0.7071 in place of 0.7071068, the camera's frame is not a rotation.
     """
     exact = same_side(quaternion, quaternion)
     for decimals in (1, 2, 3, 4, 5, 6):

@@ -99,7 +99,7 @@ def search_first(folder: Path, permanent: bool = False) -> None:
     global _permanent_folder
     _permanent_folder = _permanent_folder or permanent
     name = str(folder)
-    # site-packages is no author's folder, even if a task in it is opened.
+    # site-packages is not an author's folder, even if a task in it is opened.
     if folder.name not in LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
         _author_folders.add(name)
     if not _finder_is_installed():

@@ -473,7 +473,7 @@ def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTa
         **_source_fields(finder),
     )
     task = dataclasses.replace(task, default_kwargs={**task.default_kwargs, **chosen.kwargs})
-    # A robot without a task is shown in ManiSkill's empty scene, whose limit of 200,000 steps is no episode length.
+    # A robot without a task is shown in ManiSkill's empty scene, whose limit of 200,000 steps is not an episode length.
     return task if task.robot is None else dataclasses.replace(task, max_episode_steps=None)
 
 

@@ -290,7 +290,7 @@ def check_step_returns(
         reward: (N,) real numbers, or bools, which the rule `reward-rows` reports; None if no reward was computed.
 
     With one env shape () is allowed too. Tensors may be on any device. The problem's stage is ``returns``; its place is in
-    `source_files`, or None if the hook is inherited. NaN is no problem here: `envs.outliers` reports it.
+    `source_files`, or None if the hook is inherited. NaN is not a problem here: `envs.outliers` reports it.
     """
     from workbench.envs.evaluate_entries import (  # imports torch, which the server must not
         no_reward,

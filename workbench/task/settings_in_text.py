@@ -113,7 +113,7 @@ class TaskText:
         if one.imported is not None:
             return SettingError(f"{where} is imported: only constants of the file itself can be set")
         if one.value is None:
-            return SettingError(f"{where} is no constant: {one.why or 'it is computed'}")
+            return SettingError(f"{where} is not a constant: {one.why or 'it is computed'}")
         try:
             value = ast.literal_eval(one.value)
         except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):

@@ -47,7 +47,7 @@ class SourceWatcher:
     are polled 25 times a second by ``stat``, which takes microseconds. If there are hundreds of files, those
     saved last are polled every time, and the others in turn. After a rename, creation or deletion in one of
     their folders (most editors save in this way), all files are polled. Once ``stat`` is stable the texts are
-    compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
+    compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is not a change.
 
     `on_change` may call `follow` and `stop`. An exception of `on_change` is reported, and watching continues.
     """

@@ -83,7 +83,7 @@ def plan_duplicate(
         )
         if alone:
             raise RefusedEdit(
-                f"the camera ({call.where}) is in no list or dict, so there is no place for a second one"
+                f"the camera ({call.where}) is not in a list or dict, to which a second camera could be added"
             )
         text, indent = _renamed_text(call, new_uid), file.indent(file.inner_span(call.node)[0])
 

@@ -136,7 +136,7 @@ def _add_reward_if_success(
     try:
         rows = _rows(hook(obs=obs, action=action, info=successful), num_envs)
     except Exception:
-        # Not the task's fault: the state is no success, and the hook may rely on other conditions of a
+        # Not the task's fault: the state is not a success, and the hook may rely on other conditions of a
         # success.
         rows = np.full(num_envs, np.nan)
     seen.reward_if_success.setdefault(mode, []).append(rows)

@@ -312,7 +312,7 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotKnown(f"no {which} episode succeeds")
     if not times:
         raise NotKnown(
-            "success becomes true in no episode after its reset"
+            "success does not become true in any episode after its reset"
             if at_reset
             else "success comes at the last step only"
         )

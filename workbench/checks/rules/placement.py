@@ -421,7 +421,7 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
     Pictures, matrices and distances are scaled or turned.
 
     ## Why
-    A quaternion whose length is not 1 is no rotation. Matrices made of it are scaled or sheared, and
+    A quaternion whose length is not 1 is not a rotation. Matrices made of it are scaled or sheared, and
     distances between rotations are wrong. PhysX may or may not normalise the quaternion, so CPU and GPU may
     differ.
 
@@ -548,7 +548,9 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
     if not robots:
         raise NotApplicable("the task has no robot")
     if len(robots) > 1:
-        raise NotKnown("the task has several robots, and which of them must touch which body is not known")
+        raise NotKnown(
+            "the task has several robots, and the rule cannot know which robot must touch which body"
+        )
     if not _is_fixed(robots[0].robot):
         raise NotApplicable("the robot moves around")
     tool = getattr(robots[0], "tcp", None)  # an error in the author's property is reported

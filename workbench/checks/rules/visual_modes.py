@@ -56,7 +56,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    Two envs observe pictures. The rule moves each dynamic body and each articulation that is no robot (40 at
+    Two envs observe pictures. The rule moves each dynamic body and each articulation that is not a robot (40 at
     most) by some centimetres without a step, and calls `_get_obs_extra` again: a number that changes follows
     the body. Goals (kinematic and hidden bodies) may be in the observation. Contacts and forces do not change
     without a step, so `is_grasping` is no finding. The result is *not known* if there is no renderer, and

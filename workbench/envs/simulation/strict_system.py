@@ -88,7 +88,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     was set and not applied is lost at the next fetch; an apply after a step, without a fetch between, moves
     every body of every env back; and a read before the fetch returns old state. `BatchedCpuSystem` does what
     a stock CPU env does. This class tracks the values that a GPU would have, reports where they differ, and
-    changes no bit. It compares values, not calls: setting a pose to its present value is no breach.
+    changes no bit. It compares values, not calls: setting a pose to its present value is not a breach.
     """
 
     rules: BrokenRules
@@ -384,7 +384,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 continue
             differs = differ(mirror.now[mirror.at], was)
             if mirror is self._mirrors.links:
-                # Ignore velocities of links other than roots: they are fetched on demand, which is no change.
+                # Ignore velocities of links other than roots: they are fetched on demand, which is not a change.
                 differs[~np.isin(mirror.rows, self._laid_out.root_rows), 7:] = False
             changed = mirror.rows[differs.any(axis=1)]
             changed = changed[~reset.numpy()[mirror.envs[changed]]]

@@ -218,7 +218,7 @@ def _with_rows(
     # If all envs are restored, the value may be replaced, unless it is a tensor of another shape.
     if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
         if listed:
-            return "it is no list with an entry for each env now"
+            return "it is not a list with an entry for each env any more"
         return f"it had shape ({', '.join(['N', *map(str, shape[1:])])}) and has another shape or type now"
     if listed:
         new: Any = list(value) if fits else [None] * env.num_envs

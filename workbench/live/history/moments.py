@@ -594,7 +594,7 @@ class History:
     def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask
         if jumped.any():
-            # Success or fail in a restored state is no event of this moment: it happened at the origin.
+            # Success or fail in a restored state is not an event of this moment: it happened at the origin.
             restored = stepped.restored
             flag = RESET if restored is None else BY_HAND if restored.moved else WENT_BACK
             return np.where(jumped, flag, 0).astype(np.uint8)

@@ -145,7 +145,9 @@ class LogPanel(PagePart[SessionView]):
             live=True,
             longest=MAX_FILTER_CHARACTERS,
         )
-        self._hold = tick(server, "Pause", PauseLog, "on", False, hint="New lines wait while you read.")
+        self._hold = tick(
+            server, "Pause", PauseLog, "on", False, hint="New lines are shown after you switch this off."
+        )
         self._html = server.gui.add_html("")
         self._tools = server.gui.add_html("")
         self._vitals = server.gui.add_html("")

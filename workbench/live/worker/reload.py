@@ -169,13 +169,13 @@ def why_new_process(
     change = find_change(before.source, texts, str(before.file), before.class_name, inherited)
     same_scene = same_file and before.followed and change.level != "rebuilt"
     if failed:
-        reason = "the version before failed while it ran"
+        reason = "the previous version failed while it ran"
     elif while_running:
-        reason = f"the version before has changed {some_of(while_running)}"
+        reason = f"the previous version has changed {some_of(while_running)}"
     elif same_scene or not before.followed:
         return None  # imports and scene do not change
     elif at_load:
-        reason = f"the version before has changed {some_of(at_load)}"
+        reason = f"the previous version has changed {some_of(at_load)}"
     else:
         reason = f"the effects of importing {gone} cannot be undone"
     return NewProcessNeeded(reason, same_scene)

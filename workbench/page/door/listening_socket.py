@@ -172,7 +172,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except (FileNotFoundError, NotADirectoryError):
         raise ServerError(
-            f"There is no folder {folder} for the socket; mkdir -m 700 {folder} makes one that is yours alone."
+            f"There is no folder {folder} for the socket; mkdir -m 700 {folder} makes a folder that only you can use."
         ) from None
     try:
         found = os.fstat(handle)
