@@ -37,8 +37,8 @@ def test_an_env_that_is_told_to_hold_still_or_was_reset_forgets_its_joint_target
 ) -> None:
     chooser.use("sliders", None)
     still = hold_action(task.parts, N)
-    for forget in (lambda: chooser.tell(task, [1], [], []), lambda: chooser.begin([1])):
-        chooser.tell(task, [0, 1], [0], [0.25])
+    for forget in (lambda: chooser.set_sliders(task, [1], [], []), lambda: chooser.begin([1])):
+        chooser.set_sliders(task, [0, 1], [0], [0.25])
         assert chooser.next_action(task)[:, 0].tolist() == [0.25, 0.25]
         forget()
         action = chooser.next_action(task)

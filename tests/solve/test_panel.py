@@ -143,7 +143,7 @@ def test_a_solved_episode_can_be_saved_but_not_while_playing(solve: Solve) -> No
 def test_a_success_is_announced_once_per_episode(solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
     announced: list[str] = []
     monkeypatch.setattr(
-        "workbench.solve.panel.tell_all", lambda server, title, text, **more: announced.append(text)
+        "workbench.solve.panel.notify_all", lambda server, title, text, **more: announced.append(text)
     )
     for view in (SolveView(), SOLVED, SOLVED, SolveView(), SOLVED):
         solve.draw(view)

@@ -121,7 +121,7 @@ class ActionChooser:
                 action = np.where(where & ~np.isnan(values), values, action)
         return np.clip(action, low, high).astype(np.float32)
 
-    def tell(
+    def set_sliders(
         self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
     ) -> None:
         """Set `dimensions` of these envs' actions to slider `values`. If `dimensions` is empty, clear the

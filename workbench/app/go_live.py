@@ -28,7 +28,7 @@ from workbench.live.panels.banners import is_busy_for_long
 from workbench.machine.loop import BlockingPool, begin, do
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import choice
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render, sentence
 from workbench.page.widgets.tools import tool, tools_html
@@ -135,7 +135,7 @@ class GoLive:
         try:
             run = run_of(one.episode, state)
         except CannotEnterRecording as error:
-            self._say(str(error))
+            self._notify(str(error))
             return
         if self.recorded_source:
             run = replace(run, name=f"{run.name} as it was recorded")
@@ -155,7 +155,7 @@ class GoLive:
                 await self._enter(session, transition)
         except (CannotEnterRecording, NotCleared) as error:
             if not transition.given_up:
-                self._say(sentence(str(error)))
+                self._notify(sentence(str(error)))
         finally:
             if self._transition is transition:
                 self._transition = None
@@ -271,8 +271,8 @@ class GoLive:
         if own is not None:
             self._ending.begin(lambda: _end(*own))
 
-    def _say(self, text: str) -> None:
-        tell_all(self._shared.server, "This recording cannot be continued", text, "red")
+    def _notify(self, text: str) -> None:
+        notify_all(self._shared.server, "This recording cannot be continued", text, "red")
 
 
 class GoLivePart(PagePart[ReviewView]):

@@ -13,7 +13,7 @@ from workbench.live.commands import PauseRun
 from workbench.machine.folders import example_tasks
 from workbench.machine.loop import BlockingPool, begin, result_of
 from workbench.machine.processes.watched_thread import report_failure
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.templates import sentence
 from workbench.start.catalogue import Catalogue, Entry, Section
 from workbench.start.commands import TemplateName
@@ -134,7 +134,7 @@ class OpenTask:
             return
         file = entry.file
         if file is not None and not await self._aside.run(file.is_file):
-            self._say(f"{entry.name} is gone", f"There is no file {entry.file} any more.")
+            self._notify(f"{entry.name} is gone", f"There is no file {entry.file} any more.")
             self.catalogue.refresh()
             return
         home = self._shared.home
@@ -148,7 +148,7 @@ class OpenTask:
             reference = await self._aside.run(lambda: self._cleared(entry))
         except NotCleared as error:
             if not self._withdrawn():
-                self._say(f"{entry.name} was not opened", sentence(str(error)))
+                self._notify(f"{entry.name} was not opened", sentence(str(error)))
             return
         self._doing = f"Opening {entry.name} …"
         if not self._withdrawn():
@@ -189,5 +189,5 @@ class OpenTask:
             self._doing = "Closing the previous task: writing its recordings …"
             await self._aside.run(old.close)
 
-    def _say(self, title: str, text: str) -> None:
-        tell_all(self._shared.server, title, text, "red")
+    def _notify(self, title: str, text: str) -> None:
+        notify_all(self._shared.server, title, text, "red")

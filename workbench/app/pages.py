@@ -18,7 +18,7 @@ from workbench.page.command import Command, Refused
 from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.viser_private import wait_until_taken
 from workbench.page.scene.viewpoint import View3D
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.visitors import Done, Visitor
 
 log = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ class Pages:
         self, server: viser.ViserServer, stage: View3D, make: Callable[[Which, bool], ShownPage]
     ) -> None:
         self._server, self._stage, self._make = server, stage, make
-        self._wishes: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
         self._ending = False
         self.shown: Which | None = None
         """Name of the page that is shown; None while a page is being built."""
@@ -120,7 +120,7 @@ class Pages:
             rebuild: build the page again even if it is shown, because its session was replaced.
         """
         request = _PageRequest(which, rebuild)
-        self._wishes.put(request)
+        self._requests.put(request)
         return request.shown
 
     def do(self, command: Command, visitor: Visitor) -> Done:
@@ -143,7 +143,7 @@ class Pages:
     def _run(self) -> None:
         seen, due = -1, time.monotonic()
         while not self._ending:
-            if not self._wishes.empty():
+            if not self._requests.empty():
                 self._show_newest()
                 seen = -1
             if self._page is None:
@@ -160,31 +160,31 @@ class Pages:
         newest serial."""
         until = time.monotonic() + _IDLE_SECONDS
         while (newest := page.wait(seen, _POLL_SECONDS)) == seen and time.monotonic() < until:
-            if not self._wishes.empty() or self._ending:
+            if not self._requests.empty() or self._ending:
                 break
         return newest
 
     def _sleep(self, seconds: float) -> None:
         until = time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0 and self._wishes.empty() and not self._ending:
+        while (left := until - time.monotonic()) > 0 and self._requests.empty() and not self._ending:
             time.sleep(min(left, _POLL_SECONDS))
 
     def _show_newest(self) -> None:
-        wishes = [self._wishes.get()]
-        while not self._wishes.empty():
-            wishes.append(self._wishes.get())
-        which = wishes[-1].which
+        requests = [self._requests.get()]
+        while not self._requests.empty():
+            requests.append(self._requests.get())
+        which = requests[-1].which
         try:
-            if which != self.shown or any(wish.rebuild for wish in wishes if wish.which == which):
+            if which != self.shown or any(request.rebuild for request in requests if request.which == which):
                 self._build(which)
         except Exception as error:
             # The thread must survive, or no button could show a page again.
             log.exception("The page could not be built.")
-            for wish in wishes:
-                wish.shown.set_exception(error)
+            for request in requests:
+                request.shown.set_exception(error)
             return
-        for wish in wishes:
-            wish.shown.set_result(None)
+        for request in requests:
+            request.shown.set_result(None)
 
     def _build(self, which: Which) -> None:
         before, self.shown = self._page, None
@@ -215,7 +215,7 @@ class Pages:
         except Exception as error:
             # Drawing is retried every second, so the log limits the number of tracebacks.
             self._events_log.add(type(error), "The page could not be drawn; trying again.", error)
-            tell_all(
+            notify_all(
                 self._server,
                 "This page could not be drawn",
                 "The reason is in the terminal of the workbench. Trying again.",

@@ -9,7 +9,7 @@ import viser
 
 from workbench.app.session import Session
 from workbench.machine.loop import begin, do
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.record.state import RecordingStatus
 
 _POLL_SECONDS = 0.2
@@ -42,20 +42,20 @@ class RecordingProblems:
         while True:
             session = self._session()
             if session is not None:
-                self._tell(session.view().of(RecordingStatus))
+                self._notify(session.view().of(RecordingStatus))
             await asyncio.sleep(_POLL_SECONDS)
 
-    def _tell(self, now: RecordingStatus) -> None:
+    def _notify(self, now: RecordingStatus) -> None:
         before, self._before = self._before, now
         # Compare identities, not texts: the same problem may have occurred again since the last poll.
         if now.problem is not None and now.problem is not before.problem:
             self._on_notice(now.problem)
-            tell_all(self._server, "Not recorded", now.problem, "red")
+            notify_all(self._server, "Not recorded", now.problem, "red")
         saving = now.saving
         if not saving.failed or saving.message is before.saving.message:
             return
         if saving.refused_at is not None:
-            tell_all(self._server, "Nothing was saved", saving.message, seconds=REFUSED_SECONDS)
+            notify_all(self._server, "Nothing was saved", saving.message, seconds=REFUSED_SECONDS)
         elif saving.message != now.problem:
             self._on_notice(saving.message)
-            tell_all(self._server, "Nothing was saved", saving.message, "red")
+            notify_all(self._server, "Nothing was saved", saving.message, "red")

@@ -109,7 +109,7 @@ def check(
         executor = ThisProcess() if workers == 1 else Processes(workers)
     found = _Results(what, on_activity, on_result, on_progress)
     scheduler: Scheduler[ItemOutcome, CheckUpdate] = Scheduler(
-        plan.items, found.take, found.hear, stop, chunk=plan.chunk, tries=_TRIES, on_failure=found.fail
+        plan.items, found.take, found.take_update, stop, chunk=plan.chunk, tries=_TRIES, on_failure=found.fail
     )
     needed = needed_by(what.task, what.actions, what.options.imports)
     work = Work(
@@ -152,7 +152,7 @@ class _Results:
         self._started = 0.0
         self._outcomes: dict[int, ItemOutcome] = {}
 
-    def hear(self, update: CheckUpdate) -> None:
+    def take_update(self, update: CheckUpdate) -> None:
         if update.task is not None:
             self._see_task(update.task)
         if update.activity:

@@ -302,9 +302,9 @@ class CheckJobs:
             await load_version(self._process, job, load)
             began = began or time.monotonic()
             self._happen(GroupBegan())
-            return await self._process.ask(CheckGroup(group, degrees, tuple(done)), hear)
+            return await self._process.ask(CheckGroup(group, degrees, tuple(done)), on_progress)
 
-        def hear(count: int, total: int, now: RuleProgress) -> None:
+        def on_progress(count: int, total: int, now: RuleProgress) -> None:
             nonlocal under_way
             under_way = now.rule if now.result is None else None
             if now.result is not None:

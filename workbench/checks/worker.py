@@ -86,7 +86,7 @@ class WorkerChecks:
         def begin(rule: str) -> None:
             on_progress(done, total, RuleProgress(rule))
 
-        def tell(rule: str, results: Iterable[RuleResult]) -> None:
+        def report(rule: str, results: Iterable[RuleResult]) -> None:
             nonlocal done
             for result in results:
                 done += 1
@@ -96,11 +96,11 @@ class WorkerChecks:
         for rule, check in group.checks.items():
             if degrees[rule] != "off" and rule not in question.known:
                 begin(rule)
-                tell(rule, check_rule(rule, check, checkup, degrees))
+                report(rule, check_rule(rule, check, checkup, degrees))
         if group is GPU_SIMULATION:
             begin("")
-            tell("", check_gpu_rules(checkup, degrees))
-            tell("", gpu_results(findings_of(checkup), checkup.silenced, degrees))
+            report("", check_gpu_rules(checkup, degrees))
+            report("", gpu_results(findings_of(checkup), checkup.silenced, degrees))
             self.close()  # the last group: free the envs' memory
         following = question.group + 1
         return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")

@@ -95,7 +95,7 @@ class RecordBar:
     def describe(self, text: str, kept: int | None = None) -> None:
         self._bar.update(self._row, description=text, completed=kept)
 
-    def _say(self, line: str) -> None:
+    def _print_progress(self, line: str) -> None:
         """Print a progress line if stderr is not a terminal: in a file the bar is drawn only once, at the
         end, so a log would be silent for hours."""
         if not err.is_terminal:
@@ -117,11 +117,11 @@ class RecordBar:
             doing = f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else "")
             self.describe(doing)
             if time.monotonic() - self._said > _LOG_SECONDS:
-                self._say(doing)
+                self._print_progress(doing)
         if now.over is not None:
             number, kept = now.over
             named = self._named(number) if self._first_seed is None else f"seed {self._first_seed + number}"
-            self._say(f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept")
+            self._print_progress(f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept")
 
 
 _LOG_SECONDS = 30.0

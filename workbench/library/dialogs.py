@@ -15,7 +15,7 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.commands import AnswerDialog, CloseDialog, TypeAnswer
 from workbench.page.widgets.dialog import Dialog
 from workbench.page.widgets.fields import Field
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.templates import counted, render, size
 from workbench.page.widgets.tools import Tool, tools_html
 
@@ -99,7 +99,7 @@ class LibraryEdits:
         try:
             self._library.check_delete(ids)
         except LibraryError as error:
-            self._tell(error)
+            self._notify(error)
             return
         self._ask(
             "Delete recordings",
@@ -183,15 +183,15 @@ class LibraryEdits:
         try:
             await self._disk.run(work)
         except LibraryError as error:
-            self._tell(error)
+            self._notify(error)
         except Exception as error:
             report_failure("An edit of the library failed", error)
-            tell_all(
+            notify_all(
                 self._server,
                 "Failed",
                 "The change to the library failed; the reason is in the terminal.",
                 "red",
             )
 
-    def _tell(self, error: LibraryError) -> None:
-        tell_all(self._server, "Not possible", str(error), seconds=8.0)
+    def _notify(self, error: LibraryError) -> None:
+        notify_all(self._server, "Not possible", str(error), seconds=8.0)

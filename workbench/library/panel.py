@@ -53,7 +53,7 @@ from workbench.page.command import Command
 from workbench.page.commands import AnswerDialog, TypeAnswer
 from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.modality_colours import address_of_jpeg
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
@@ -394,18 +394,18 @@ class LibraryPanel(PagePart[object]):
         ids = self.selected()
         if not ids:
             body = f"Select a row of the library first: {action.label} applies to the selection."
-            tell_all(self._server, "Nothing is selected", body, seconds=8.0)
+            notify_all(self._server, "Nothing is selected", body, seconds=8.0)
         elif action.most is not None and len(ids) > action.most:
             body = f"{action.label} works for at most {action.most} recordings at once: select fewer."
-            tell_all(self._server, f"{len(ids)} recordings are selected", body, seconds=8.0)
+            notify_all(self._server, f"{len(ids)} recordings are selected", body, seconds=8.0)
         elif action.reads and (why := self._why_unreadable(ids, action.salvages)):
-            tell_all(self._server, f"{action.label} needs a recording that is not damaged", why, "red")
+            notify_all(self._server, f"{action.label} needs a recording that is not damaged", why, "red")
         else:
             action.run(ids)
             for row in self._library.view().rows if action.salvages else ():
                 if row.id in ids and row.problem:
                     body = f"{row.problem} The part that can be read is shown."
-                    tell_all(self._server, "This recording is damaged", body, "orange")
+                    notify_all(self._server, "This recording is damaged", body, "orange")
 
     def _why_unreadable(self, ids: tuple[str, ...], salvages: bool) -> str:
         """Reason why none of these recordings can be read; empty if at least one of them can be read.

@@ -102,7 +102,7 @@ class Planner:
         Begins an episode, as `reset` does, in each chosen env that has none.
 
         Args:
-            env_idx: the envs to plan for, in turn; None for all. The others hold still.
+            env_idx: the envs to plan for, one after the other; None for all. The other envs hold still.
 
         Raises:
             NotAlike: the task builds different bodies in each env, so that no env can stand for another.

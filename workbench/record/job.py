@@ -298,18 +298,18 @@ class _Recording:
             self.scheduler.lower(last + 1)
             for surplus in [number for number in self._kept if number > last]:
                 self._remove(self._kept.pop(surplus))
-        self._tell((number, self._kept.get(number)))
+        self._report_progress((number, self._kept.get(number)))
 
     def _failed(self, failure: Failure) -> None:
         self._ended += len(failure.numbers)
         self._updates.failed(failure)
-        self._tell()
+        self._report_progress()
 
     def _on_update(self, update: RecordUpdate) -> None:
         if self._updates.take(update):
-            self._tell()
+            self._report_progress()
 
-    def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
+    def _report_progress(self, over: tuple[int, Written | None] | None = None) -> None:
         kept = len(self._kept)
         self._on_progress(self._updates.progress(kept, over, self.scheduler, self._wanted is None))
 

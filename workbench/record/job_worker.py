@@ -382,10 +382,10 @@ class _Episodes:
                 self._begin(env, self._waiting.popleft())
                 begun = True
         if begun:
-            self._tell(0)
+            self._send_progress(0)
         return bool(self._running)
 
-    def _tell(self, made: int) -> None:
+    def _send_progress(self, made: int) -> None:
         """Send the progress of the episodes after `made` more control steps."""
         at = tuple((number, self._steps[env]) for env, number in self._running.items())
         self._queue.send_update(RecordUpdate(underway=BatchProgress(at, self._limit, made)))
@@ -488,7 +488,7 @@ class _Episodes:
             self._planned.add_step(step, sorted(self._running))
         for env in self._running:
             self._steps[env] += 1
-        self._tell(len(self._running))
+        self._send_progress(len(self._running))
         for env in list(self._running):
             over = self._is_over(env, step)
             if not over and self._out_of_time(env):

@@ -152,7 +152,7 @@ def rescore_recordings(
             verdict = of.verdict(failure.problem.message)
             take(number, RescoredRecording(of.place, verdict, of.note, failed=True, problem=failure.problem))
 
-    def hear(update: RescoreUpdate) -> None:
+    def take_update(update: RescoreUpdate) -> None:
         nonlocal steps
         if update.activity:
             on_activity(update.activity)
@@ -164,7 +164,7 @@ def rescore_recordings(
             on_progress(len(results), len(setup.items), steps)
 
     scheduler: Scheduler[RescoredRecording, RescoreUpdate] = Scheduler(
-        sorted(setup.items), take, hear, chunk=setup.chunk, tries=_MAX_CHUNK_STARTS, on_failure=failed
+        sorted(setup.items), take, take_update, chunk=setup.chunk, tries=_MAX_CHUNK_STARTS, on_failure=failed
     )
     folders, files = _needed(setup)
     if executor.elsewhere:

@@ -60,9 +60,9 @@ class PastRescorer:
         do(self._jobs.close)
 
     def _failed(self, failure: JobFailed) -> None:
-        self._tell(state="failed", why=str(failure), problem=failure.problem)
+        self._send_view(state="failed", why=str(failure), problem=failure.problem)
 
-    def _tell(self, **values: Any) -> None:
+    def _send_view(self, **values: Any) -> None:
         """Update these fields of the view, and send it."""
         self._update = replace(self._update, view=replace(self._update.view, **values))
         self._happen(self._update)
@@ -80,7 +80,7 @@ class PastRescorer:
                 summed_up = now
                 names, differing = past.names()
                 summary = {"verdicts": tuple(past.verdicts()), "names": names, "differing_names": differing}
-            self._tell(
+            self._send_view(
                 state="rescoring",
                 done=done,
                 steps=done,
@@ -100,12 +100,12 @@ class PastRescorer:
                 await self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
         finally:
             past.release()
-        self._tell(state="done")
+        self._send_view(state="done")
 
     async def _load(self, job: Job, load: Load, past: RescoredPast) -> None:
         if self._process.has_loaded(load):
             return
-        self._tell(state="loading")
+        self._send_view(state="loading")
         if self._process.num_envs == past.num_envs:
             # Loading tries the new code at the env's current moment, where the last job ended. The code may
             # raise or hang there, although it works from the recorded start states. So restore a recorded

@@ -214,14 +214,14 @@ class Rescorer:
         if effects:
             self._jobs.stop()
 
-    def _tell(self, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
+    def _send_view(self, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
         """Update these fields of the view, add verdicts, and send the view."""
         known = (*self.view.verdicts, *verdicts)
         view = replace(self.view, verdicts=known, done=len(known), **values)
         self._happen(RescoringUpdate(self._rescoring.job, view))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._tell(state="failed", why=str(failure), problem=failure.problem)
+        self._send_view(state="failed", why=str(failure), problem=failure.problem)
 
     # --- the job -------------------------------------------------------------------------------------
 
@@ -236,14 +236,14 @@ class Rescorer:
             notes = [f"with {_code_text(group)}" for group in groups[:MAX_VERSIONS]]
             notes += [f"and {len(groups) - MAX_VERSIONS} more"] if len(groups) > MAX_VERSIONS else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
-            self._tell(broken_files, state="asking", notes=tuple(notes))
+            self._send_view(broken_files, state="asking", notes=tuple(notes))
             cleared = await self._aside.run(
                 lambda: self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
             )
             await self._rescore_each(job, groups, cleared, use_env_states)
         finally:
             self._process.end()  # so that code of the recordings does not stay loaded
-        self._tell(state="done")
+        self._send_view(state="done")
 
     async def _rescore_each(
         self,
@@ -267,7 +267,7 @@ class Rescorer:
                 why = f"{failure}: {failure.problem.message}" if failure.problem is not None else str(failure)
                 rescored = {verdict.of.id for verdict in self.view.verdicts}
                 missing = [file for file in group.files if file.id not in rescored]
-                self._tell([Verdict(file, task=group.info.task, why_not=why) for file in missing])
+                self._send_view([Verdict(file, task=group.info.task, why_not=why) for file in missing])
         if failures and len(failures) == len(groups):
             raise failures[0]
 
@@ -282,7 +282,7 @@ class Rescorer:
             nonlocal began
             began = began or time.monotonic() - self.view.seconds
             seconds, steps = time.monotonic() - began, self.view.steps + part.steps
-            self._tell(part.verdicts, state="rescoring", steps=steps, seconds=seconds)
+            self._send_view(part.verdicts, state="rescoring", steps=steps, seconds=seconds)
 
         with ExitStack() as stack:
             if group.recorded_source:
@@ -292,7 +292,7 @@ class Rescorer:
                     raise JobFailed(str(error)) from error
             hidden = await self._aside.run(lambda: hidden_modules_text(task))
             warnings = tuple(dict.fromkeys((*self.view.warnings, *hidden)))
-            self._tell(state="loading", task=_code_text(group), warnings=warnings)
+            self._send_view(state="loading", task=_code_text(group), warnings=warnings)
             or_else = with_renderer(group.options)
             question = Rescore(task, group.options, or_else, group.files, use_env_states)
             last = await self._process.ask(question, on_part)

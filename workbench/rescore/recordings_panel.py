@@ -18,7 +18,7 @@ from workbench.live.timeline_commands import Seek, StopRescoring
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import by_name, choice, tick
 from workbench.page.widgets.line_chart import part_round
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
@@ -165,11 +165,11 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
     def rescore_and_notify(self, ids: Sequence[str]) -> None:
         """Call `rescore` and notify every page; for a click outside this tab."""
         if not ids:
-            tell_all(self._server, "Nothing to rescore", "No recording is selected or open.")
+            notify_all(self._server, "Nothing to rescore", "No recording is selected or open.")
             return
         self.rescore(ids)
         title = f"Rescoring {counted(len(ids), 'recording')}"
-        tell_all(self._server, title, "What differs now is listed under Rescore.", None, 4.0)
+        notify_all(self._server, title, "What differs now is listed under Rescore.", None, 4.0)
 
     def rescore(self, ids: Sequence[str]) -> None:
         """Start rescoring these recordings of the library."""

@@ -245,7 +245,9 @@ class Review:
     def _give_scenes(self, number: int, job: Job, without: Sequence[Opened], shapes: SharedShapes) -> None:
         """Make the scenes of recordings that contain none."""
 
-        def tell(one: Opened, scene: str, making: bool = False, episode: Episode | None = None) -> None:
+        def send_update(
+            one: Opened, scene: str, making: bool = False, episode: Episode | None = None
+        ) -> None:
             event = SceneUpdate(number, one.id, scene, making, episode)
             post(lambda: self._happened(event))
 
@@ -257,28 +259,30 @@ class Review:
         wanted = [] if make is None else [one for one in without if one.episode.env_states]
         for one in without:
             if one in wanted:
-                tell(one, "its scene is made next", making=True)
+                send_update(one, "its scene is made next", making=True)
             else:
-                tell(one, "This recording contains no scene to draw.")
+                send_update(one, "This recording contains no scene to draw.")
         if make is None or not wanted:
             return
         scenes = make(
-            [one.episode for one in wanted], check, lambda index, text: tell(wanted[index], text, making=True)
+            [one.episode for one in wanted],
+            check,
+            lambda index, text: send_update(wanted[index], text, making=True),
         )
         try:
             for one, made in zip(wanted, scenes, strict=True):
                 if isinstance(made, SceneError):
-                    tell(one, str(made))
+                    send_update(one, str(made))
                     continue
                 missed = f"Not restored: {'; '.join(made[1])}." if made[1] else ""
-                tell(one, missed, episode=_shared(made[0], shapes))
+                send_update(one, missed, episode=_shared(made[0], shapes))
         except _Stopped:
             return
         except Exception as error:
             # The process may send anything. Without this the page would stay on "making" without a reason.
             report_failure("Scenes of recordings could not be made", error)
             for one in wanted:
-                tell(one, f"Its scene could not be made ({type(error).__name__}: {error}).")
+                send_update(one, f"Its scene could not be made ({type(error).__name__}: {error}).")
 
 
 def _shared(episode: Episode, shapes: SharedShapes) -> Episode:

@@ -376,8 +376,8 @@ class Making:
                 one = replace(one, sizes=tuple(path.stat().st_size for path in one.paths))
             results.append(one)
 
-        def hear(progress: tuple[float, str]) -> None:
-            post(lambda: self._hear(*progress))
+        def on_progress(progress: tuple[float, str]) -> None:
+            post(lambda: self._show_progress(*progress))
 
         try:
             if download:
@@ -385,14 +385,14 @@ class Making:
                 # A new folder each time: a file of the same name may already exist.
                 wanted = replace(wanted, folder=Path(tempfile.mkdtemp(dir=self._scratch)))
             work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
-            Processes(1).run(work, Scheduler(range(1), take, hear, lambda: self._stopped))
+            Processes(1).run(work, Scheduler(range(1), take, on_progress, lambda: self._stopped))
         except OSError as error:
             results.append(f"The export could not be started: {error}.")
         except PoolError as error:
             results.append(sentence(str(error)))
         return results
 
-    def _hear(self, done: float, doing: str) -> None:
+    def _show_progress(self, done: float, doing: str) -> None:
         self._view = replace(self._view, done=done, doing=doing)
 
 

@@ -20,7 +20,7 @@ from workbench.page.commands import ShownOn
 from workbench.page.widgets.editor_links import LinkTo, no_links
 from workbench.page.widgets.fields import choice, slider
 from workbench.page.widgets.line_chart import ChartLine, LineChart, part_round
-from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.notices import notify_all
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
@@ -232,7 +232,7 @@ class SolvePanel(PagePart[SessionView]):
         self._draw_traced(view)
         self._draw_looked_at(view)
         self._draw_chart(solve)
-        self._tell(view)
+        self._notify(view)
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
         """Draw the paths of the last plan's rollouts.
@@ -285,7 +285,7 @@ class SolvePanel(PagePart[SessionView]):
         )
         self._chart.draw("Mean reward per step over the horizon of the plan", steps, lines)
 
-    def _tell(self, view: SessionView) -> None:
+    def _notify(self, view: SessionView) -> None:
         """Notify every page of newly solved envs, whichever tab is open: a person may look at another tab
         during planning."""
         solved = view.of(SolveView).solved
@@ -294,7 +294,7 @@ class SolvePanel(PagePart[SessionView]):
         for env, step in new[:MAX_NAMED_ENVS]:
             several = view.task is not None and view.task.num_envs > 1
             what = f"Env {env} is solved" if several else "The episode is solved"
-            tell_all(self._server, "Solved", f"{what} at step {step}.", color=None, seconds=8.0)
+            notify_all(self._server, "Solved", f"{what} at step {step}.", color=None, seconds=8.0)
 
 
 def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:

@@ -204,11 +204,14 @@ class SeedsJobs:
             return
         work = Work(_run, setup, SolveReport, SeedsUpdate, "that solves")
 
-        def tell(update: SeedsUpdate) -> None:
+        def send_update(update: SeedsUpdate) -> None:
             post(lambda: job.stopped or self._happen(update))
 
         deal: Scheduler[SolveReport, SeedsUpdate] = Scheduler(
-            range(1), lambda number, report: tell(SeedsUpdate(report=report)), tell, lambda: job.stopped
+            range(1),
+            lambda number, report: send_update(SeedsUpdate(report=report)),
+            send_update,
+            lambda: job.stopped,
         )
         try:
             Processes(1).run(work, deal)

@@ -136,29 +136,29 @@ class RegisteredTasks:
         try:
             lacking = await self._disk.run(lambda: lines_if_lacking("The list of ManiSkill's tasks"))
             if lacking is not None:
-                self._tell(problem=" ".join(lacking))
+                self._change_view(problem=" ".join(lacking))
                 return
             self._folder = self._given_folder or await self._disk.run(_version_folder)
             cached = await self._disk.run(lambda: _read_list(self._folder))
-            self._tell(ids=tuple(cached.ids), why_not=cached.not_drawn)
+            self._change_view(ids=tuple(cached.ids), why_not=cached.not_drawn)
             if not cached.ids:
                 await self._list()
-            self._tell(pictures=await self._disk.run(self._find_pictures))
+            self._change_view(pictures=await self._disk.run(self._find_pictures))
             await self._draw_all()
         except Exception as error:
             report_failure("ManiSkill's tasks could not be listed and drawn", error)
         finally:
             self._process.end()
-            self._tell(doing="")
+            self._change_view(doing="")
 
     async def _list(self) -> None:
-        self._tell(doing="listing ManiSkill's tasks")
+        self._change_view(doing="listing ManiSkill's tasks")
         try:
             ids = await self._ask(ListTasks())
         except JobFailed as failure:
-            self._tell(problem=f"ManiSkill's tasks could not be listed: {failure}.")
+            self._change_view(problem=f"ManiSkill's tasks could not be listed: {failure}.")
             return
-        self._tell(ids=tuple(_checked(ids)))
+        self._change_view(ids=tuple(_checked(ids)))
         await self._keep_list()
 
     async def _draw_all(self) -> None:
@@ -169,9 +169,9 @@ class RegisteredTasks:
                 continue
             while not self._may_work():
                 self._process.end()
-                self._tell(doing="")
+                self._change_view(doing="")
                 await asyncio.sleep(_POLL_SECONDS)
-            self._tell(doing=f"drawing {env_id}")
+            self._change_view(doing=f"drawing {env_id}")
             try:
                 drawn = await self._ask(DrawTask(env_id))
                 if drawn.pixels is None:
@@ -182,9 +182,9 @@ class RegisteredTasks:
                 await self._note_failure(env_id, str(failure))
                 continue
             except OSError as error:
-                self._tell(problem=f"Pictures of tasks cannot be cached: {error}.")
+                self._change_view(problem=f"Pictures of tasks cannot be cached: {error}.")
                 return
-            self._tell(pictures=self.view.pictures | {env_id})
+            self._change_view(pictures=self.view.pictures | {env_id})
             count += 1
             if count % PICTURES_PER_PROCESS == 0:
                 self._process.end()
@@ -206,7 +206,7 @@ class RegisteredTasks:
         before = self.view.why_not.get(env_id)
         tries = 1 if before is None else before.tries + 1
         failed = NotDrawn(why[:MAX_REASON_CHARACTERS], needs_download, tries, time.time())
-        self._tell(why_not={**self.view.why_not, env_id: failed})
+        self._change_view(why_not={**self.view.why_not, env_id: failed})
         await self._keep_list()
 
     async def _keep_list(self) -> None:
@@ -224,7 +224,7 @@ class RegisteredTasks:
     def _file(self, env_id: str) -> Path:
         return self._folder / f"{env_id}.jpg"
 
-    def _tell(self, **changes: object) -> None:
+    def _change_view(self, **changes: object) -> None:
         view = replace(self.view, **changes)  # type: ignore[arg-type]
         if view != self.view:
             self.view = view

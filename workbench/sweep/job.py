@@ -307,17 +307,17 @@ class _Sweep:
         self._updates.over(number)
         self._rows[number] = self._row(number, written)
         self._kept += 1
-        self._tell((number, written))
+        self._report_progress((number, written))
 
     def _failed(self, failure: Failure) -> None:
         self._updates.failed(failure)
         for number in failure.numbers:
             self._rows[number] = self._row(number, None, str(TaskError(failure.problem)))
-        self._tell()
+        self._report_progress()
 
     def _on_update(self, update: RecordUpdate) -> None:
         if self._updates.take(update):
-            self._tell()
+            self._report_progress()
 
-    def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
+    def _report_progress(self, over: tuple[int, Written | None] | None = None) -> None:
         self._on_progress(self._updates.progress(self._kept, over, self.scheduler, counts_parts=True))

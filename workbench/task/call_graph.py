@@ -433,8 +433,8 @@ def _code_text(node: ast.stmt) -> str:
 
 
 def _matching_line(old: str, new: str, line: int, before: ast.stmt, after: ast.stmt) -> int:
-    """The line of `after` that has the text of `line`. If several have it: the one nearest to the place that
-    `line` has within `before`. If none has it: the line at that place."""
+    """The line of `after` with the text of `line`. If several lines have this text, the one nearest to the place
+    of `line` within `before`; if none has this text, the line at that place."""
     text = old.splitlines()[line - 1].strip()
     at = after.lineno + line - before.lineno
     end = after.end_lineno or after.lineno

@@ -112,7 +112,7 @@ class _ForkServer:
             while (found := os.waitpid(-1, os.WNOHANG))[0]:
                 pid, status = found
                 if (end := self._workers.pop(pid, None)) is not None:
-                    _tell(end, ForkEnded(os.waitstatus_to_exitcode(status)))
+                    _send(end, ForkEnded(os.waitstatus_to_exitcode(status)))
                     end.close()
 
     def _fork(self, request: NewWorker, fds: list[int]) -> None:
@@ -121,18 +121,18 @@ class _ForkServer:
         looker.register(end, select.POLLIN)
         pid, server = 0, os.getpid()
         if looker.poll(0):
-            _tell(end, ForkEnded(-signal.SIGTERM))  # the worker was cancelled while we imported
+            _send(end, ForkEnded(-signal.SIGTERM))  # the worker was cancelled while we imported
         else:
             try:
                 pid = os.fork()
             except OSError as error:  # no memory, or too many processes; running workers must continue
                 os.write(fds[-1], f"workbench: no worker can be started: {error}\n".encode())
-                _tell(end, ForkEnded(1))
+                _send(end, ForkEnded(1))
             else:
                 if pid == 0:
                     self._become_worker(request, server, end, fds[1:])
         if pid:
-            _tell(end, Forked(pid))
+            _send(end, Forked(pid))
             with suppress(OSError):
                 os.setpgid(pid, pid)  # the child does this too, but the group may be signalled earlier
             self._workers[pid] = end
@@ -169,7 +169,7 @@ class _ForkServer:
         sys.exit()
 
 
-def _tell(end: socket.socket, message: Forked | ForkEnded) -> None:
+def _send(end: socket.socket, message: Forked | ForkEnded) -> None:
     with suppress(OSError):  # the client has closed its end
         end.send(pack_message(message))
 

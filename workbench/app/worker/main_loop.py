@@ -148,7 +148,7 @@ class Worker:
             SingleStep: self._single_step,
             Reset: self._reset,
             Settings: self._apply_settings,
-            SetSliderAction: self._tell,
+            SetSliderAction: self._set_sliders,
             ReadPolicyAgain: self._read_policy_again,
             FollowPlan: self._follow_plan,
             PlaceCamera: self._cameras.place,
@@ -423,18 +423,18 @@ class Worker:
             self._task.run("importing the policy", self._use_action_source)
             self._task.guarded(self._send_slider_action)
 
-    def _tell(self, request: SetSliderAction) -> None:
-        def tell(opened: OpenedTask) -> None:
+    def _set_sliders(self, request: SetSliderAction) -> None:
+        def set_sliders(opened: OpenedTask) -> None:
             task = opened.env
             # The page may have sent this before it knew of a new version, which may have fewer envs or
             # another robot.
             if max(request.env_idx, default=0) < task.num_envs and max(request.dimensions, default=0) < width(
                 task.parts
             ):
-                self._chooser.tell(task, request.env_idx, request.dimensions, request.values)
+                self._chooser.set_sliders(task, request.env_idx, request.dimensions, request.values)
                 self._send_slider_action(opened)
 
-        self._task.guarded(tell)
+        self._task.guarded(set_sliders)
 
     def _send_slider_action(self, opened: OpenedTask) -> None:
         if self._chooser.by_sliders:

@@ -235,7 +235,7 @@ def _at(env: BaseEnv, begun: States, goal: str) -> States:
 
 
 def _between(states: States, begun: States, shares: NDArray[np.float64]) -> States:
-    """States at rest on the way back to where the episode began.
+    """States at rest on the straight way from `states` to the states in which the episode began.
 
     Args:
         shares: (N,) share of the way; 0 is `states`, 1 is `begun`.

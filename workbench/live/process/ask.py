@@ -377,7 +377,7 @@ class _Process:
         """Start the process and read its events until it ends; returns why it ended."""
         # The author's output is not shown, since the worker that plays shows the same. Only the end of
         # stderr is kept, to explain a death.
-        worker = WorkerProcess(self._hear, self._niceness)
+        worker = WorkerProcess(self._keep_end_of_stderr, self._niceness)
         code: int | None = None
         with self._lock:
             self._worker = worker
@@ -404,7 +404,7 @@ class _Process:
         if self._background._process is self:
             self._background.take(event)
 
-    def _hear(self, stream: str, piece: bytes) -> bool:
+    def _keep_end_of_stderr(self, stream: str, piece: bytes) -> bool:
         if stream == "stderr":
             self._stderr = (self._stderr + piece)[-_STDERR_BYTES:]
         return False

@@ -64,16 +64,16 @@ def limited(message: str) -> Iterator[None]:
         return
     if watcher.process is None:
         _start(watcher)
-    _tell(watcher, " ".join(message.split()).encode()[:_MAX_MESSAGE_BYTES])
+    _send_line(watcher, " ".join(message.split()).encode()[:_MAX_MESSAGE_BYTES])
     watcher.within = True
     try:
         yield
     finally:
         watcher.within = False
-        _tell(watcher, b"")
+        _send_line(watcher, b"")
 
 
-def _tell(watcher: _Watcher, line: bytes) -> None:
+def _send_line(watcher: _Watcher, line: bytes) -> None:
     with suppress(BrokenPipeError):  # the watcher was killed: nothing is limited from now on
         os.write(watcher.pipe, line + b"\n")
 

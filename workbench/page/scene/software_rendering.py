@@ -55,8 +55,8 @@ class InSoftware:
         """Scene and tolerance for which the simplified shapes are ready."""
         self._simplifying: asyncio.Task[None] | None = None
         self._aside = BlockingPool("simplify")
-        server.on_client_connect(self._came)
-        server.on_client_disconnect(self._left)
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
 
     def ask(self) -> None:
         """Ask the browsers to report (``browser.js``). Call it in the main panel of each new page."""
@@ -64,20 +64,20 @@ class InSoftware:
 
     def report_arrived(self, visitor: Visitor) -> None:
         """Handle the report that a page renders in software."""
-        post(partial(self._know, visitor.client.client_id, True))
+        post(partial(self._set_in_software, visitor.client.client_id, True))
 
-    async def _came(self, client: viser.ClientHandle) -> None:
+    async def _on_connect(self, client: viser.ClientHandle) -> None:
         post(partial(self._expect, client.client_id))
 
-    async def _left(self, client: viser.ClientHandle) -> None:
+    async def _on_disconnect(self, client: viser.ClientHandle) -> None:
         post(partial(self._forget, client.client_id))
 
     def _expect(self, page: int) -> None:
         self._pages[page] = None
         self._decide()
-        later(REPORT_TIMEOUT_SECONDS, lambda: self._know(page, self._pages.get(page) or False))
+        later(REPORT_TIMEOUT_SECONDS, lambda: self._set_in_software(page, self._pages.get(page) or False))
 
-    def _know(self, page: int, in_software: bool) -> None:
+    def _set_in_software(self, page: int, in_software: bool) -> None:
         if page in self._pages:
             self._pages[page] = in_software
             self._decide()

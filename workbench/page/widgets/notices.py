@@ -9,7 +9,7 @@ from typing import Literal
 import viser
 
 
-def tell_all(
+def notify_all(
     server: viser.ViserServer,
     title: str,
     text: str,

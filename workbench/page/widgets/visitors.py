@@ -60,7 +60,7 @@ class Visitor:
             self._sent.remove()
         self._sent = self.client.gui.add_html(html)
 
-    def tell(self, text: str, title: str = "Not possible") -> None:
+    def notify(self, text: str, title: str = "Not possible") -> None:
         self.client.add_notification(title, text, color="orange", auto_close_seconds=NOTICE_SECONDS)
 
 
@@ -85,17 +85,17 @@ class Visitors:
         self._events_log = RateLimitedLog()
         self._by_name: dict[str, Visitor] = {}
         self._by_client: dict[int, Visitor] = {}
-        server.on_client_connect(self._came)
-        server.on_client_disconnect(self._left)
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
 
-    async def _came(self, client: viser.ClientHandle) -> None:
+    async def _on_connect(self, client: viser.ClientHandle) -> None:
         # A random name instead of viser's client number: viser counts from 0 again at each start, and a
         # client that reconnects gets a new number.
         visitor = Visitor(secrets.token_urlsafe(12), client)
         self._by_name[visitor.name] = self._by_client[client.client_id] = visitor
         client.gui.add_html(render("page_name", name=visitor.name))
 
-    async def _left(self, client: viser.ClientHandle) -> None:
+    async def _on_disconnect(self, client: viser.ClientHandle) -> None:
         visitor = self._by_client.pop(client.client_id)
         del self._by_name[visitor.name]
 
@@ -119,11 +119,11 @@ class Visitors:
         try:
             await asyncio.wrap_future(submit(self._carry_out(command, visitor)))
         except Refused as reason:
-            visitor.tell(str(reason))
+            visitor.notify(str(reason))
             return str(reason)
         except Exception:
             log.exception("Failed: %r", command)
-            visitor.tell("The command failed. The reason is in the terminal.", "Failed")
+            visitor.notify("The command failed. The reason is in the terminal.", "Failed")
             return "it failed"
         return ""
 
@@ -150,7 +150,7 @@ class Visitors:
                     command = self.commands.decode(*message.do)
                 except Refused as reason:
                     refused = str(reason)
-                    visitor.tell(refused)
+                    visitor.notify(refused)
                 else:
                     refused = await self.ask(command, visitor)
             except (msgspec.DecodeError, UnicodeDecodeError, KeyError) as fault:
