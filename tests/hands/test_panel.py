@@ -21,7 +21,7 @@ from workbench.hands.commands import (
     ToggleHandles,
     WriteBodyPose,
 )
-from workbench.hands.pose_edit import PoseEdit, PoseWanted
+from workbench.hands.start_edit import StartEdit, StartWanted
 from workbench.hands.state import BodyMoved, BodyPulled
 from workbench.hands.state import Hands as State
 from workbench.live.commands import SelectBody
@@ -197,13 +197,13 @@ def test_the_sliders_of_the_action_are_hidden_while_keys_drive(live_page: Live) 
 
 def test_a_planned_pose_is_shown_as_a_diff_and_saved_by_its_button(live_page: Live) -> None:
     change = SourceEdit("/tasks/push.py", "a\np = [0, 0, 0]\n", "a\np = [0.1, 0, 0]\n", ("goal too",), None)
-    edit = PoseEdit("planned", 1, "cube", edit=change, message="This writes where cube begins.")
+    edit = StartEdit("planned", 1, edit=change, message="This writes where cube begins.")
     view = running(3, selected_env=1)
     live_page.do(SelectBody(body="cube"))
-    live_page.show(replace(view, playing=False, features={PoseEdit: edit}))
+    live_page.show(replace(view, playing=False, features={StartEdit: edit}))
     text = words_of(live_page.part("Inspect").html())
     for words in ("Write into the file", "p = [0.1, 0, 0]", "goal too", "Save to push.py"):
         assert words in text
     live_page.do(WriteBodyPose())
     wanted = live_page.asked[-1]
-    assert isinstance(wanted, PoseWanted) and wanted.body == "cube" and len(wanted.pose) == 7
+    assert isinstance(wanted, StartWanted) and wanted.wanted.of == "cube"

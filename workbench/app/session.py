@@ -21,10 +21,10 @@ from workbench.cameras.state import view_of as studio_view_of
 from workbench.checks.profile import BeginProfile, EndProfile, ProfileJobs
 from workbench.checks.state import BeginCheck, CheckJobs, Checks, ChecksView, EndCheck, KeepCheckAfterSave
 from workbench.envs.recorded_run import RecordedRun
-from workbench.hands.pose_edit import ChangePoseFile, CheckPose, PlanPose
-from workbench.hands.pose_jobs import PoseJobs
 from workbench.hands.reset_until import BeginSearch, EndSearch, SearchJobs
 from workbench.hands.resets import BeginSampling, EndSampling, ResetJobs
+from workbench.hands.start_edit import ChangeStartFile, CheckStart, PlanStart
+from workbench.hands.start_jobs import StartJobs
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import (
     FileSaved,
@@ -167,7 +167,7 @@ class Session:
         self._policies = PolicySearch(self._happen)
         self._resets = ResetJobs(self._background, self._happen)
         self._searches = SearchJobs(self._background, self._happen)
-        self._poses = PoseJobs(self._background, self._happen)
+        self._starts = StartJobs(self._background, self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Created after the parts above, since it reports recovered episodes at once.
@@ -250,8 +250,8 @@ class Session:
                 self._resets.perform(effect)
             case BeginSearch() | EndSearch():
                 self._searches.perform(effect)
-            case PlanPose() | ChangePoseFile() | CheckPose():
-                self._poses.perform(effect)
+            case PlanStart() | ChangeStartFile() | CheckStart():
+                self._starts.perform(effect)
             case BeginPlan() | EndPlan():
                 self._plans.perform(effect)
             case BeginSeeds() | EndSeeds():
@@ -301,7 +301,7 @@ class Session:
             state.hands,
             state.resets,
             state.search,
-            state.pose_edit,
+            state.start_edit,
         )
         return view_of(
             self._run,
@@ -395,7 +395,7 @@ class Session:
         self._profiles.close()
         self._resets.close()
         self._searches.close()
-        self._poses.close()
+        self._starts.close()
         self._plans.close()
         self._seeds.close()
         self._policies.close()

@@ -9,9 +9,9 @@ from workbench.cameras.events import StudioEffect, StudioEvent
 from workbench.cameras.state import Studio
 from workbench.checks import profile as of_profile
 from workbench.checks import state as of_checks
-from workbench.hands import pose_edit as of_pose
 from workbench.hands import reset_until as of_search
 from workbench.hands import resets as of_resets
+from workbench.hands import start_edit as of_start
 from workbench.hands import state as of_hands
 from workbench.live import apply as of_run
 from workbench.live import policies as of_policies
@@ -41,7 +41,7 @@ SessionEvent = (
     | of_hands.HandEvent
     | of_resets.ResetsEvent
     | of_search.SearchEvent
-    | of_pose.PoseEvent
+    | of_start.StartEvent
 )
 Effect = (
     RunEffect
@@ -56,7 +56,7 @@ Effect = (
     | StudioEffect
     | of_resets.ResetsEffect
     | of_search.SearchEffect
-    | of_pose.PoseEffect
+    | of_start.StartEffect
     | Then
 )
 DOES: frozenset[type[Command]] = (
@@ -71,7 +71,7 @@ DOES: frozenset[type[Command]] = (
     | of_hands.DOES
     | of_resets.DOES
     | of_search.DOES
-    | of_pose.DOES
+    | of_start.DOES
 )
 """Commands that `apply` handles."""
 
@@ -102,7 +102,7 @@ class State:
     """Where resets put the bodies."""
     search: of_search.ResetSearch = of_search.ResetSearch()
     """The search for a first state that meets a condition."""
-    pose_edit: of_pose.PoseEdit = of_pose.PoseEdit()
+    start_edit: of_start.StartEdit = of_start.StartEdit()
     """The change of the file that gives a body another first pose."""
 
 
@@ -125,7 +125,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     hands, for_hands = of_hands.apply(state.hands, event, run, recording.env_idx)
     resets, for_resets = of_resets.apply(state.resets, event, run)
     search, for_search = of_search.apply(state.search, event, run)
-    pose, for_pose = of_pose.apply(state.pose_edit, event, run)
+    start, for_start = of_start.apply(state.start_edit, event, run)
     new = State(
         run,
         recording,
@@ -139,7 +139,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         hands,
         resets,
         search,
-        pose,
+        start,
     )
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
@@ -154,6 +154,6 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         *for_solver,
         *for_resets,
         *for_search,
-        *for_pose,
+        *for_start,
     ]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio, *for_hands]

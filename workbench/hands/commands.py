@@ -44,19 +44,19 @@ class WriteBodyPose(Command, frozen=True):
     context = "live"
 
 
-class SavePoseChange(Command, frozen=True):
+class SaveStartChange(Command, frozen=True):
     """Save the shown change of a body's first pose to the file."""
 
     context = "live"
 
 
-class RevertPoseChange(Command, frozen=True):
+class RevertStartChange(Command, frozen=True):
     """Revert the saved change of a body's first pose in the file."""
 
     context = "live"
 
 
-class DropPoseChange(Command, frozen=True):
+class DropStartChange(Command, frozen=True):
     """Close the change of a body's first pose; the file stays as it is."""
 
     context = "live"

@@ -22,8 +22,8 @@ from workbench.hands.commands import (
     ToggleHandles,
     WriteBodyPose,
 )
-from workbench.hands.pose_edit import PoseEdit, PoseWanted
-from workbench.hands.pose_panel import pose_edit_html
+from workbench.hands.start_edit import BodyPose, StartEdit, StartWanted
+from workbench.hands.start_panel import start_edit_html
 from workbench.hands.state import (
     BodyMoved,
     BodyPulled,
@@ -157,7 +157,7 @@ class HandsPanel(PagePart[SessionView]):
             self._handles_on,
             view.of(Hands).all_envs,
             view.playing,
-            view.of(PoseEdit),
+            view.of(StartEdit),
         )
 
     def draw(self, view: SessionView) -> None:
@@ -183,8 +183,8 @@ class HandsPanel(PagePart[SessionView]):
             "Write into the file", WriteBodyPose(), WriteBodyPose.help(), off=bool(why) or view.playing
         )
         self._tools.content = tools_html([handles, write])
-        edit = view.of(PoseEdit)
-        self._change.content, self._change.visible = pose_edit_html(edit), edit.stage != "none"
+        edit = view.of(StartEdit)
+        self._change.content, self._change.visible = start_edit_html(edit), edit.stage != "none"
         name_fold(self._fold, TITLE, known.body)
 
     def do(self, command: Command, visitor: Visitor) -> None:
@@ -195,7 +195,7 @@ class HandsPanel(PagePart[SessionView]):
                 of = self._required()
                 if why := why_not_moved(of.kind):
                     raise Refused(why)
-                self._session.happen(PoseWanted(of.body, tuple(map(float, of.pose))))
+                self._session.happen(StartWanted(BodyPose(of.body, tuple(map(float, of.pose)))))
             case SetBodyPosition(of=axis, to=metres):
                 pose = self._required().pose.copy()
                 pose[XYZ.index(axis)] = metres

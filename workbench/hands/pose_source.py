@@ -1,6 +1,6 @@
 """Finds where the first pose of a body is written in the author's files, and plans the edit that changes it.
 
-Only the text is read. Whether the edit does what was asked is decided by running it (`pose_jobs`).
+Only the text is read. Whether the edit does what was asked is decided by running it (`start_jobs`).
 """
 
 from __future__ import annotations

@@ -1,14 +1,81 @@
-"""Questions about resets for a worker."""
+"""Questions to a worker about resets: where the bodies are afterwards, and the numbers that were drawn."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.envs.inspection import Overlap
 from workbench.machine.processes.wire import Question
+from workbench.source.parsed import Place, TracedValue
+
+
+@dataclass(frozen=True, eq=False)
+class Operand:
+    """A number, or one for each drawn column, that the drawn numbers are combined with."""
+
+    at: Place
+    """The expression where the operand is used."""
+    value: TracedValue | None
+    """None if it could not be followed to where it is written."""
+    why: str = ""
+    """Reason why `value` is None."""
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """An arithmetic operation on drawn numbers."""
+
+    sign: Literal["+", "-", "from", "*", "/", "negated"]
+    """``from``: the drawn number is subtracted from the operand."""
+    operand: Operand | None
+    """None for ``negated``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """A call that drew uniform numbers in 0 to 1, in the author's files, and what the expression around it makes of them.
+
+    A call of ManiSkill's ``uniform(low, high)`` is such a call too.
+    """
+
+    at: Place
+    """The call."""
+    whole: Place
+    """The whole arithmetic expression; the call itself without one."""
+    numbers: NDArray[np.float32]
+    """(N, M) drawn numbers in 0 to 1, M for each env."""
+    bounds: tuple[Operand, ...] = ()
+    """Operands that state the lowest and the highest number: ``low, high`` of ``uniform``, and ``low, high, low`` of
+    ``torch.rand(b) * (high - low) + low``. Empty without them."""
+    operations: tuple[Operation, ...] = ()
+    """Operations after `bounds` are applied, innermost first."""
+    simple: bool = True
+    """Whether the call and `operations` are the whole way to `whole`; False for a call of another function that draws."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeStart:
+    """The first moment after a reset of all envs."""
+
+    poses: NDArray[np.float32]
+    """(N, B, 7), as in `StepResult.poses`."""
+    draws: tuple[Draw, ...]
+    """In the order in which they were drawn."""
+
+
+@dataclass(frozen=True)
+class ReadStart(Question[EpisodeStart]):
+    """Reset all envs with this seed, and record what is drawn."""
+
+    seed: int
+    texts: Mapping[str, str]
+    """The author's files by path, in which calls that draw are looked for. They may differ from the executed texts in
+    their line ends."""
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,7 @@ class Project:
         reader: SourceFile,
         read: ast.AST,
         concerns: Callable[[str, str], bool] = lambda path, owner: True,
+        together: Collection[ast.AST] = (),
     ) -> str | None:
         """The place, as text, of another reader of the binding; None if there is none.
 
@@ -107,6 +108,7 @@ class Project:
             concerns: returns whether objects of a class (file and name) may have the binding as an attribute.
                 It is asked about attributes of ``self``; on any other object, every attribute with the name
                 counts.
+            together: further nodes that do not count.
         """
         home, name = binding.file, binding.name
         scope = home.scopes(binding.node)[0]
@@ -125,7 +127,12 @@ class Project:
                     found = attribute and isinstance(node, ast.Constant) and node.value == name
                 owner = class_of_self(file, node)
                 found = found and (owner is None or not attribute or concerns(file.path, owner))
-                if found and node is not read and not _other_element(file, node, read):
+                if (
+                    found
+                    and node is not read
+                    and node not in together
+                    and not _other_element(file, node, read)
+                ):
                     return _location(file, node, reader)
         return None
 

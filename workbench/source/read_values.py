@@ -9,7 +9,7 @@ import inspect
 import math
 import operator
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -74,15 +74,10 @@ def trace_call(
     Returns:
         None if the call is not in one of the project's files.
     """
-    code = frame.f_code
-    place = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,) * 4)
-    if code.co_filename not in project.texts or None in place:
+    found = running_call(project, frame)
+    if found is None:
         return None
-    file = project.file(code.co_filename)
-    line, end_line, column, end_column = place
-    call = file.at(line, end_line, column, end_column)  # type: ignore[arg-type]
-    if not isinstance(call, ast.Call):
-        return None
+    file, call = found
     reader = ValueReader(project, file, call, frame)
     parts: dict[str, TracedValue] = {}
     unknown: dict[str, str] = {}
@@ -102,6 +97,18 @@ def trace_call(
     return Trace(Place(file.path, *file.inner_span(call)), file.qualname(call), parts, unknown)
 
 
+def running_call(project: Project, frame: FrameType) -> tuple[SourceFile, ast.Call] | None:
+    """The file and the call that `frame` is making; None if the call is not in one of the project's files."""
+    code = frame.f_code
+    place = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,) * 4)
+    if code.co_filename not in project.texts or None in place:
+        return None
+    file = project.file(code.co_filename)
+    line, end_line, column, end_column = place
+    call = file.at(line, end_line, column, end_column)  # type: ignore[arg-type]
+    return (file, call) if isinstance(call, ast.Call) else None
+
+
 def _same(a: Plain, b: Plain) -> bool:
     """Whether two values are equal within single precision."""
     if isinstance(a, tuple) and isinstance(b, tuple):
@@ -118,11 +125,22 @@ class ValueReader:
     followed to its assignment. If several assignments may apply, the name is followed to the one whose value
     equals the name's present value. Any doubt raises `Unknown`, because the result decides which line of the
     author's file is edited.
+
+    Args:
+        together: names that are edited together; none of them counts as another reader of their value.
     """
 
-    def __init__(self, project: Project, file: SourceFile, call: ast.expr, frame: FrameType) -> None:
+    def __init__(
+        self,
+        project: Project,
+        file: SourceFile,
+        call: ast.expr,
+        frame: FrameType,
+        together: Collection[ast.AST] = (),
+    ) -> None:
         self._project, self._frame = project, frame
         self._around = file.scopes(call)
+        self._together = together
 
     def computed(self, file: SourceFile, node: ast.AST) -> Unknown:
         return Unknown(f"`{file.one_line(node)}` is computed when the task runs")
@@ -344,16 +362,19 @@ class ValueReader:
             )
             if not inside:
                 raise Unknown(f"`{code}` comes from {binding.dotted}, which is not one of your files")
-            others = self._project.readers(binding, file, node, _concerned_by(binding))
+            others = self._readers(binding, file, node)
             where, value, more = self._follow_bindings(file, node, inside)
             return where, value, others or more
         if binding.value is None:
             home = "the file" if binding.file is file else binding.file.name
             raise Unknown(f"`{code}` cannot be read in {home}: {binding.why}")
-        others = self._project.readers(binding, file, node, _concerned_by(binding))
+        others = self._readers(binding, file, node)
         if isinstance(binding.node, ast.Assign) and len(binding.node.targets) > 1:
             others = others or f"line {binding.file.line(binding.node)} gives it to several names"
         return binding.file, binding.value, others
+
+    def _readers(self, binding: Binding, file: SourceFile, node: ast.expr) -> str | None:
+        return self._project.readers(binding, file, node, _concerned_by(binding), self._together)
 
     def _binding_of_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
         """The binding whose value is the name's present value. Raises Unknown unless there is exactly one."""

@@ -26,9 +26,10 @@ from workbench.envs.maniskill_private import mark_camera_configs
 from workbench.envs.step_result import StepResult
 from workbench.envs.task_drawings import drawings
 from workbench.envs.task_env import TaskEnv
-from workbench.hands.questions import SampleReset
+from workbench.hands.questions import EpisodeStart, ReadStart, SampleReset
 from workbench.hands.reach_worker import LedArms, set_arm
 from workbench.hands.reset_worker import first_states
+from workbench.hands.start_worker import read_start
 from workbench.hands.worker import Hand, move_body, move_joints
 from workbench.live.messages import (
     SCENE_KEPT,
@@ -89,6 +90,7 @@ from workbench.rescore.replay_past import rescore_moments
 from workbench.rescore.verdict import Rescore, RescoreMoments
 from workbench.solve.questions import PlanActions
 from workbench.solve.worker import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
+from workbench.source.parsed import RefusedEdit
 from workbench.task.blame import blamed
 from workbench.task.description import Pulled, Restored, TaskOptions
 from workbench.task.modules import executed_modules
@@ -257,6 +259,8 @@ class Worker:
             poses = self._reset_envs(opened, None, question.seed).poses
             with blamed("step", opened.loaded, opened.env):
                 return first_states(opened.env, poses)
+        if isinstance(question, ReadStart):
+            return self._read_start(opened, question)
         if isinstance(question, RescoreMoments):
             return rescore_moments(opened, question)
         if isinstance(question, CaptureMoment):
@@ -553,6 +557,16 @@ class Worker:
         self._arms.forget(env_idx)
         self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
         return step
+
+    def _read_start(self, opened: OpenedTask, question: ReadStart) -> EpisodeStart:
+        try:
+            return read_start(
+                question,
+                opened.env.num_envs,
+                lambda: self._reset_envs(opened, None, question.seed).poses,
+            )
+        except RefusedEdit as refused:
+            raise CannotAnswer(refused.reason) from refused
 
     def _reset_with_seeds(
         self, task: TaskEnv, env_idx: tuple[int, ...] | None, seed: int | list[int] | None

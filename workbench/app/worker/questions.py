@@ -6,7 +6,7 @@ from typing import get_args
 
 from workbench.cameras.questions import CameraQuestion
 from workbench.checks.questions import CheckGroup, ProfileStep
-from workbench.hands.questions import SampleReset
+from workbench.hands.questions import ReadStart, SampleReset
 from workbench.live.messages import Load, PlaceCamera, Reset, WarmUp
 from workbench.live.questions_without_task import DrawTask, ListTasks, MakeScene
 from workbench.record.questions import CaptureMoment
@@ -15,6 +15,6 @@ from workbench.solve.questions import PlanActions
 
 QUESTIONS = (
     Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), CheckGroup, ProfileStep, PlanActions, RescoreMoments, CaptureMoment,
-    Rescore, SampleReset, MakeScene, ListTasks, DrawTask,
+    ReadStart, Rescore, SampleReset, MakeScene, ListTasks, DrawTask,
 )  # fmt: skip
 """All types that a `Call` may contain."""

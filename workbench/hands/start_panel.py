@@ -5,20 +5,20 @@ from __future__ import annotations
 from pathlib import PurePath
 
 from workbench.cameras.edit_panel import diff_lines
-from workbench.hands.commands import DropPoseChange, RevertPoseChange, SavePoseChange
-from workbench.hands.pose_edit import IN_FILE, PoseEdit
+from workbench.hands.commands import DropStartChange, RevertStartChange, SaveStartChange
+from workbench.hands.start_edit import IN_FILE, StartEdit
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool
 
 MOODS = {"checked": "good", "refused": "warn", "mismatch": "bad"}
 
 
-def pose_edit_html(edit: PoseEdit) -> str:
+def start_edit_html(edit: StartEdit) -> str:
     """The change and its stage as HTML; empty without a change."""
     if edit.stage == "none":
         return ""
     source = edit.edit if edit.stage != "undone" else None
-    tools = pose_tools(edit)
+    tools = start_tools(edit)
     return render(
         "camera_writing",
         message=edit.message,
@@ -38,11 +38,11 @@ def pose_edit_html(edit: PoseEdit) -> str:
     )
 
 
-def pose_tools(edit: PoseEdit) -> list[Tool]:
+def start_tools(edit: StartEdit) -> list[Tool]:
     """Buttons for the change."""
     if edit.stage == "planned" and edit.edit is not None:
-        save = tool(f"Save to {edit.edit.names}", SavePoseChange(), tone="main")
-        return [save, tool("Discard the change", DropPoseChange())]
+        save = tool(f"Save to {edit.edit.names}", SaveStartChange(), tone="main")
+        return [save, tool("Discard the change", DropStartChange())]
     if edit.stage in IN_FILE:
-        return [tool("Revert in the file", RevertPoseChange()), tool("Close", DropPoseChange())]
-    return [tool("Close", DropPoseChange())] if edit.stage in ("refused", "undone") else []
+        return [tool("Revert in the file", RevertStartChange()), tool("Close", DropStartChange())]
+    return [tool("Close", DropStartChange())] if edit.stage in ("refused", "undone") else []

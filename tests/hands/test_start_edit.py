@@ -14,8 +14,8 @@ import pytest
 
 from tests.drive.session import TASKS, jump, live_session, runs, start_over, wait_until
 from workbench.app.session import Session
-from workbench.hands.commands import DropPoseChange, RevertPoseChange, SavePoseChange
-from workbench.hands.pose_edit import PoseEdit, PoseWanted
+from workbench.hands.commands import DropStartChange, RevertStartChange, SaveStartChange
+from workbench.hands.start_edit import BodyPose, StartEdit, StartWanted
 from workbench.hands.state import BodyMoved
 from workbench.live.commands import PauseRun, PlayRun
 from workbench.page.command import Refused
@@ -45,7 +45,7 @@ def session(child_process: None, file: Path, tmp_path_factory: pytest.TempPathFa
 @pytest.fixture
 def opened(session: Session, file: Path) -> Session:
     """The session with the original file, paused."""
-    session.do(DropPoseChange())
+    session.do(DropStartChange())
     session.do(PauseRun())
     if file.read_text() != MINIMAL:
         file.write_text(MINIMAL)
@@ -58,14 +58,14 @@ def load(session: Session, file: Path, text: str) -> None:
     runs(session, text)
 
 
-def edit(session: Session, *stages: str) -> PoseEdit:
-    return wait_until(session, lambda v: v.of(PoseEdit).stage in stages, " or ".join(stages)).of(PoseEdit)
+def edit(session: Session, *stages: str) -> StartEdit:
+    return wait_until(session, lambda v: v.of(StartEdit).stage in stages, " or ".join(stages)).of(StartEdit)
 
 
-def want(session: Session) -> PoseEdit:
+def want(session: Session) -> StartEdit:
     """Move the cube, ask to write its pose, and wait for the plan."""
     jump(session, lambda: session.happen(BodyMoved("cube", (0, 1), THERE)))
-    session.happen(PoseWanted("cube", THERE))
+    session.happen(StartWanted(BodyPose("cube", THERE)))
     return edit(session, "planned", "refused")
 
 
@@ -83,7 +83,7 @@ def test_a_pose_of_each_reset_is_shown_saved_checked_and_reverted(opened: Sessio
     planned = want(opened)
     assert planned.stage == "planned", planned.message
     assert file.read_text() == MINIMAL, "nothing is written yet"
-    opened.do(SavePoseChange())
+    opened.do(SaveStartChange())
     done = edit(opened, "checked", "mismatch", "refused")
     assert done.stage == "checked", done.message
     assert changed_lines(MINIMAL, file.read_text()) == [
@@ -93,9 +93,9 @@ def test_a_pose_of_each_reset_is_shown_saved_checked_and_reverted(opened: Sessio
         "+         self.cube.set_pose(Pose.create_from_pq(p=p, q=[0.9238795, 0.0, 0.0, 0.3826834]))",
     ]
     np.testing.assert_allclose(first_poses(opened, 7), [THERE, THERE], atol=1e-4)
-    opened.do(RevertPoseChange())
+    opened.do(RevertStartChange())
     wait_until(
-        opened, lambda v: v.of(PoseEdit).stage == "undone" and not v.of(PoseEdit).writing, "the old text"
+        opened, lambda v: v.of(StartEdit).stage == "undone" and not v.of(StartEdit).writing, "the old text"
     )
     assert file.read_text() == MINIMAL
 
@@ -107,7 +107,7 @@ def test_a_builders_pose_is_written_where_no_reset_sets_another(opened: Session,
     load(opened, file, text)
     planned = want(opened)
     assert planned.stage == "planned", planned.message
-    opened.do(SavePoseChange())
+    opened.do(SaveStartChange())
     assert edit(opened, "checked", "mismatch").stage == "checked"
     assert [line.strip("+- ") for line in changed_lines(text, file.read_text())] == [
         "builder.initial_pose = sapien.Pose(p=[0, 0, 0.03])",
@@ -146,16 +146,16 @@ def test_a_random_pose_is_refused(opened: Session, file: Path) -> None:
 def test_an_edit_that_the_author_made_meanwhile_is_not_overwritten(opened: Session, file: Path) -> None:
     assert want(opened).stage == "planned"
     load(opened, file, MINIMAL + "# mine\n")
-    opened.do(SavePoseChange())
+    opened.do(SaveStartChange())
     done = edit(opened, "refused")
     assert "edited since" in done.message and file.read_text() == MINIMAL + "# mine\n"
 
 
 def test_what_was_not_read_is_not_saved_and_a_running_body_is_not_written(opened: Session) -> None:
-    for command in (SavePoseChange(), RevertPoseChange()):
+    for command in (SaveStartChange(), RevertStartChange()):
         with pytest.raises(Refused):
             opened.do(command)
     opened.do(PlayRun())
     with pytest.raises(Refused, match="Pause"):
-        opened.happen(PoseWanted("cube", THERE))
+        opened.happen(StartWanted(BodyPose("cube", THERE)))
     opened.do(PauseRun())

@@ -1,0 +1,215 @@
+"""Plans, runs, writes and checks the change of how episodes begin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.cameras.edit.plan_request import texts_on_disk
+from workbench.checks.state import load_version
+from workbench.hands.pose_source import lines_to_copy as pose_lines
+from workbench.hands.pose_source import plan_pose
+from workbench.hands.questions import EpisodeStart, ReadStart
+from workbench.hands.spawn_source import AXES, measure_spawn, plan_spawn, why_no_range
+from workbench.hands.spawn_source import lines_to_copy as spawn_lines
+from workbench.hands.start_edit import (
+    Beginning,
+    ChangeStartFile,
+    CheckStart,
+    PlanStart,
+    SpawnRange,
+    StartChecked,
+    StartEffect,
+    StartEvent,
+    StartFileFailed,
+    StartPlanned,
+    StartRefused,
+)
+from workbench.live.messages import Load
+from workbench.live.process.ask import Background
+from workbench.live.process.background_jobs import Job, JobFailed, Jobs
+from workbench.machine.loop import BlockingPool, begin, do
+from workbench.pictures.camera_conventions import angle_between
+from workbench.source.parsed import RefusedEdit, plain_line_ends
+from workbench.task.description import TaskDescription
+from workbench.task.write_edits import SourceEdit, apply, revert, why_not_writable
+
+Poses = NDArray[np.float64]
+POSITION_TOLERANCE_METRES = 2e-4
+ANGLE_TOLERANCE_RADIANS = 4e-4
+"""Tolerances that cover the rounding of written numbers."""
+
+
+class StartJobs:
+    """Performs the effects: one plan or check at a time. Used on the loop, except `close`."""
+
+    def __init__(self, process: Background, happen: Callable[[StartEvent], object]) -> None:
+        """
+        Args:
+            process: the background process, which resets the task with the old and the new text.
+            happen: handles the resulting events.
+        """
+        self._process, self._happen = process, happen
+        self._asked: PlanStart | CheckStart | None = None
+        self._jobs = Jobs(lambda: None, self._failed)
+        self._aside = BlockingPool("pose-edits")
+
+    def perform(self, effect: StartEffect) -> None:
+        match effect:
+            case PlanStart():
+                self._asked = effect
+                self._jobs.start("the change", lambda job: self._plan(job, effect))
+            case CheckStart():
+                self._asked = effect
+                self._jobs.start("the check", lambda job: self._check(job, effect))
+            case ChangeStartFile():
+                begin(self._change(effect))
+
+    def close(self) -> None:
+        """Wait for a running write, and begin no more work. Must not be called on the loop's thread."""
+        do(self._jobs.close)
+        self._aside.close()
+
+    async def _plan(self, job: Job, effect: PlanStart) -> None:
+        try:
+            edit = await self._verified(job, effect)
+        except RefusedEdit as refused:
+            snippet = refused.snippet or _lines_to_copy(effect.wanted)
+            self._happen(StartRefused(effect.number, refused.reason, snippet))
+        else:
+            self._happen(StartPlanned(effect.number, edit))
+
+    async def _verified(self, job: Job, effect: PlanStart) -> SourceEdit:
+        """The planned change, after a run of the new text has confirmed it. Raises RefusedEdit."""
+        task, wanted = effect.task, effect.wanted
+        if task.file is None or not task.source_files:
+            raise RefusedEdit(f"{task.class_name} is installed, and installed files are not edited")
+        texts = await self._aside.run(partial(texts_on_disk, task))
+        if any(plain_line_ends(text) != task.source.get(path) for path, text in texts.items()):
+            raise RefusedEdit("the file was edited since it was loaded; save it, let it load and try again")
+        before = await self._read(job, effect.load, effect.seeds, texts)
+        edit = await self._aside.run(partial(_planned, texts, task, before, wanted))
+        for change in edit.changes:
+            if why := await self._aside.run(partial(why_not_writable, change.file)):
+                raise RefusedEdit(why)
+        texts |= {change.file: change.new_text for change in edit.changes}
+        new = {change.file: plain_line_ends(change.new_text) for change in edit.changes}
+        changed = replace(effect.load, source={**task.source, **new})
+        after = await self._read(job, changed, effect.seeds, texts)
+        if after[0].poses.shape != before[0].poses.shape:
+            raise RefusedEdit("the change would add or remove bodies")
+        if why := difference(after, task, wanted):
+            raise RefusedEdit(f"a run of the changed file shows: {why}")
+        others = _moved(before, after, task, wanted.of)
+        if others:
+            note = f"{', '.join(others)} will begin elsewhere too."
+            edit = replace(edit, notes=(*edit.notes, note))
+        return edit
+
+    async def _check(self, job: Job, effect: CheckStart) -> None:
+        task, wanted = effect.task, effect.wanted
+        why = f"The new version has no body {wanted.of}"
+        if wanted.of in task.geometry.body_names:
+            starts = await self._read(job, effect.load, effect.seeds, task.source)
+            why = difference(starts, task, wanted)
+        self._happen(StartChecked(effect.number, why))
+
+    async def _read(
+        self, job: Job, load: Load, seeds: tuple[int, ...], texts: Mapping[str, str]
+    ) -> list[EpisodeStart]:
+        # The scene is built again, because a reset does not move a body whose pose only its builder sets.
+        load = replace(load, level="rebuilt", fresh=True)
+
+        async def ask() -> list[EpisodeStart]:
+            await load_version(self._process, job, load)
+            return [await self._process.ask(ReadStart(seed, texts)) for seed in seeds]
+
+        return await self._process.in_turns(job, ask)
+
+    async def _change(self, wanted: ChangeStartFile) -> None:
+        change = revert if wanted.revert else apply
+        try:
+            await self._aside.run(partial(change, wanted.edit))
+        except RefusedEdit as refused:
+            self._happen(StartFileFailed(wanted.number, refused.reason))
+
+    def _failed(self, failure: JobFailed) -> None:
+        asked = self._asked
+        assert asked is not None, "a job has failed"
+        problem = failure.problem
+        why = f"{failure}: {problem.message}" if problem is not None else str(failure)
+        if isinstance(asked, PlanStart):
+            self._happen(StartRefused(asked.number, why, _lines_to_copy(asked.wanted)))
+        else:
+            self._happen(StartChecked(asked.number, f"It could not be checked: {why}"))
+
+
+def _planned(
+    texts: Mapping[str, str], task: TaskDescription, before: Sequence[EpisodeStart], wanted: Beginning
+) -> SourceEdit:
+    """The change that does what is wanted; see `plan_pose` and `plan_spawn`. Raises RefusedEdit."""
+    row = task.geometry.body_names.index(wanted.of)
+    if isinstance(wanted, SpawnRange):
+        spawn = measure_spawn(before, row)
+        if spawn is None:
+            raise RefusedEdit(f"no env has {wanted.of}")
+        return plan_spawn(texts, wanted.of, spawn, (wanted.x, wanted.y))
+    poses = _poses_of(before, row)
+    if not len(poses) or np.ptp(poses, axis=0).max() > POSITION_TOLERANCE_METRES:
+        raise RefusedEdit(f"{wanted.of} begins at different poses in different episodes or envs")
+    assert task.file is not None, "its files are edited"
+    here = tuple(map(float, poses[0]))
+    return plan_pose(texts, task.file, task.class_name, wanted.of, here, wanted.pose)
+
+
+def _lines_to_copy(wanted: Beginning) -> str:
+    if isinstance(wanted, SpawnRange):
+        return spawn_lines(wanted.of, (wanted.x, wanted.y))
+    return pose_lines("", wanted.pose)
+
+
+def _poses_of(starts: Sequence[EpisodeStart], row: int) -> Poses:
+    """(K, 7) poses of a body in the envs that have it."""
+    poses = np.concatenate([start.poses[:, row] for start in starts]).astype(np.float64)
+    return poses[np.isfinite(poses).all(axis=1)]
+
+
+def _moved(
+    before: Sequence[EpisodeStart], after: Sequence[EpisodeStart], task: TaskDescription, but: str
+) -> list[str]:
+    """Names of the bodies, except `but`, that begin elsewhere with the same seeds."""
+    apart = np.stack([new.poses - old.poses for old, new in zip(before, after, strict=True)])
+    moved = np.nanmax(np.abs(apart), axis=(0, 1, 3), initial=0.0) > POSITION_TOLERANCE_METRES
+    names = task.geometry.body_names
+    return [name for name, is_moved in zip(names, moved, strict=True) if is_moved and name != but]
+
+
+def difference(starts: Sequence[EpisodeStart], task: TaskDescription, wanted: Beginning) -> str:
+    """How the first moments of episodes differ from what is wanted, as text; empty if they do not."""
+    row = task.geometry.body_names.index(wanted.of)
+    if isinstance(wanted, SpawnRange):
+        return _other_ranges(starts, row, wanted)
+    for pose in _poses_of(starts, row):
+        away = float(np.linalg.norm(pose[:3] - wanted.pose[:3]))
+        turned = angle_between(pose[3:], wanted.pose[3:])
+        if away > POSITION_TOLERANCE_METRES or turned > ANGLE_TOLERANCE_RADIANS:
+            return f"{wanted.of} begins {away:.4g} m and {np.degrees(turned):.3g} degrees from the requested pose"
+    return ""
+
+
+def _other_ranges(starts: Sequence[EpisodeStart], row: int, wanted: SpawnRange) -> str:
+    spawn = measure_spawn(starts, row)
+    if spawn is None:
+        return f"no env has {wanted.of}"
+    for name, found, to in zip(AXES, spawn.ranges, (wanted.x, wanted.y), strict=True):
+        if to is None:
+            continue
+        if found is None:
+            return why_no_range(name, wanted.of)
+        if not np.allclose(found, to, rtol=0, atol=POSITION_TOLERANCE_METRES):
+            return f"{name} of {wanted.of} begins from {found[0]:.4g} to {found[1]:.4g} m"
+    return ""
