@@ -23,6 +23,7 @@ from workbench.checks.state import BeginCheck, CheckJobs, Checks, ChecksView, En
 from workbench.envs.recorded_run import RecordedRun
 from workbench.hands.reset_until import BeginSearch, EndSearch, SearchJobs
 from workbench.hands.resets import BeginSampling, EndSampling, ResetJobs
+from workbench.hands.spawn import EndSpawn, MeasureSpawn, SpawnJobs
 from workbench.hands.start_edit import ChangeStartFile, CheckStart, PlanStart
 from workbench.hands.start_jobs import StartJobs
 from workbench.live.effects import Asked, Later, Then
@@ -168,6 +169,7 @@ class Session:
         self._resets = ResetJobs(self._background, self._happen)
         self._searches = SearchJobs(self._background, self._happen)
         self._starts = StartJobs(self._background, self._happen)
+        self._spawns = SpawnJobs(self._background, self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Created after the parts above, since it reports recovered episodes at once.
@@ -252,6 +254,8 @@ class Session:
                 self._searches.perform(effect)
             case PlanStart() | ChangeStartFile() | CheckStart():
                 self._starts.perform(effect)
+            case MeasureSpawn() | EndSpawn():
+                self._spawns.perform(effect)
             case BeginPlan() | EndPlan():
                 self._plans.perform(effect)
             case BeginSeeds() | EndSeeds():
@@ -302,6 +306,7 @@ class Session:
             state.resets,
             state.search,
             state.start_edit,
+            state.spawn,
         )
         return view_of(
             self._run,
@@ -396,6 +401,7 @@ class Session:
         self._resets.close()
         self._searches.close()
         self._starts.close()
+        self._spawns.close()
         self._plans.close()
         self._seeds.close()
         self._policies.close()

@@ -11,6 +11,7 @@ from workbench.checks import profile as of_profile
 from workbench.checks import state as of_checks
 from workbench.hands import reset_until as of_search
 from workbench.hands import resets as of_resets
+from workbench.hands import spawn as of_spawn
 from workbench.hands import start_edit as of_start
 from workbench.hands import state as of_hands
 from workbench.live import apply as of_run
@@ -42,6 +43,7 @@ SessionEvent = (
     | of_resets.ResetsEvent
     | of_search.SearchEvent
     | of_start.StartEvent
+    | of_spawn.SpawnEvent
 )
 Effect = (
     RunEffect
@@ -57,6 +59,7 @@ Effect = (
     | of_resets.ResetsEffect
     | of_search.SearchEffect
     | of_start.StartEffect
+    | of_spawn.SpawnEffect
     | Then
 )
 DOES: frozenset[type[Command]] = (
@@ -72,6 +75,7 @@ DOES: frozenset[type[Command]] = (
     | of_resets.DOES
     | of_search.DOES
     | of_start.DOES
+    | of_spawn.DOES
 )
 """Commands that `apply` handles."""
 
@@ -103,7 +107,9 @@ class State:
     search: of_search.ResetSearch = of_search.ResetSearch()
     """The search for a first state that meets a condition."""
     start_edit: of_start.StartEdit = of_start.StartEdit()
-    """The change of the file that gives a body another first pose."""
+    """The change of the file that makes episodes begin elsewhere."""
+    spawn: of_spawn.SpawnBox = of_spawn.SpawnBox()
+    """The range in which resets put a body."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -126,6 +132,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     resets, for_resets = of_resets.apply(state.resets, event, run)
     search, for_search = of_search.apply(state.search, event, run)
     start, for_start = of_start.apply(state.start_edit, event, run)
+    spawn, for_spawn = of_spawn.apply(state.spawn, event, run)
     new = State(
         run,
         recording,
@@ -140,6 +147,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         resets,
         search,
         start,
+        spawn,
     )
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
@@ -155,5 +163,6 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         *for_resets,
         *for_search,
         *for_start,
+        *for_spawn,
     ]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio, *for_hands]

@@ -11,6 +11,7 @@ from workbench.page.command import Command
 
 Axis = Literal["x", "y", "z"]
 Angle = Literal["roll", "pitch", "yaw"]
+Side = Literal["x_min", "x_max", "y_min", "y_max"]
 Deflection = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 RobotName = Annotated[str, msgspec.Meta(max_length=256)]
@@ -44,20 +45,45 @@ class WriteBodyPose(Command, frozen=True):
     context = "live"
 
 
+class ShowSpawn(Command, frozen=True):
+    """Show the range in which resets put the selected body, with handles to drag its sides."""
+
+    context = "live"
+
+
+class HideSpawn(Command, frozen=True):
+    """Hide the range in which resets put a body."""
+
+    context = "live"
+
+
+class SetSpawnSide(Command, frozen=True):
+    """Put a side of the spawn range at this coordinate in the env's frame, in metres."""
+
+    side: Side
+    to: Number
+
+
+class WriteSpawn(Command, frozen=True):
+    """Show the change of the file that makes resets put the body in the shown range."""
+
+    context = "live"
+
+
 class SaveStartChange(Command, frozen=True):
-    """Save the shown change of a body's first pose to the file."""
+    """Save the shown change of how episodes begin to the file."""
 
     context = "live"
 
 
 class RevertStartChange(Command, frozen=True):
-    """Revert the saved change of a body's first pose in the file."""
+    """Revert the saved change of how episodes begin in the file."""
 
     context = "live"
 
 
 class DropStartChange(Command, frozen=True):
-    """Close the change of a body's first pose; the file stays as it is."""
+    """Close the change of how episodes begin; the file stays as it is."""
 
     context = "live"
 

@@ -17,11 +17,15 @@ from workbench.hands.commands import (
     Angle,
     Axis,
     ChooseMovedEnvs,
+    HideSpawn,
     SetBodyAngle,
     SetBodyPosition,
+    ShowSpawn,
     ToggleHandles,
     WriteBodyPose,
 )
+from workbench.hands.spawn import SpawnAsked, SpawnBox
+from workbench.hands.spawn_panel import SpawnPanel
 from workbench.hands.start_edit import BodyPose, StartEdit, StartWanted
 from workbench.hands.start_panel import start_edit_html
 from workbench.hands.state import (
@@ -107,7 +111,7 @@ class HandsPanel(PagePart[SessionView]):
         order: viser's order of the fold in its tab.
     """
 
-    does = (SetBodyPosition, SetBodyAngle, ToggleHandles, WriteBodyPose)
+    does = (SetBodyPosition, SetBodyAngle, ToggleHandles, WriteBodyPose, ShowSpawn)
 
     def __init__(
         self,
@@ -131,6 +135,7 @@ class HandsPanel(PagePart[SessionView]):
             self._angles = self._row("Rotation", SetBodyAngle, ANGLES, "Degrees about fixed axes.", 1.0)
             self._scope = scope_choice(server)
             self._tools = server.gui.add_html("")
+            self._spawn = SpawnPanel(server, session)
             self._change = server.gui.add_html("", visible=False)
         self._grip = InView(self._add_grip, "dimensions", "position", "wxyz")
         self._gizmo = server.scene.add_transform_controls(
@@ -158,6 +163,7 @@ class HandsPanel(PagePart[SessionView]):
             view.of(Hands).all_envs,
             view.playing,
             view.of(StartEdit),
+            view.of(SpawnBox),
         )
 
     def draw(self, view: SessionView) -> None:
@@ -182,7 +188,12 @@ class HandsPanel(PagePart[SessionView]):
         write = Tool(
             "Write into the file", WriteBodyPose(), WriteBodyPose.help(), off=bool(why) or view.playing
         )
-        self._tools.content = tools_html([handles, write])
+        box = view.of(SpawnBox)
+        ranged = box.stage != "none" and box.body == known.body
+        spawn: Command = HideSpawn() if ranged else ShowSpawn()
+        of_range = Tool("Spawn range", spawn, type(spawn).help(), on=ranged, off=bool(why))
+        self._tools.content = tools_html([handles, of_range, write])
+        self._spawn.show(box, known.body)
         edit = view.of(StartEdit)
         self._change.content, self._change.visible = start_edit_html(edit), edit.stage != "none"
         name_fold(self._fold, TITLE, known.body)
@@ -196,6 +207,11 @@ class HandsPanel(PagePart[SessionView]):
                 if why := why_not_moved(of.kind):
                     raise Refused(why)
                 self._session.happen(StartWanted(BodyPose(of.body, tuple(map(float, of.pose)))))
+            case ShowSpawn():
+                of = self._required()
+                if why := why_not_moved(of.kind):
+                    raise Refused(why)
+                self._session.happen(SpawnAsked(of.body))
             case SetBodyPosition(of=axis, to=metres):
                 pose = self._required().pose.copy()
                 pose[XYZ.index(axis)] = metres
@@ -221,6 +237,7 @@ class HandsPanel(PagePart[SessionView]):
     def follow(self, view: SessionView) -> None:
         """Let go if the page that drags has closed, if the pulled env was reset, or if a body that is being moved plays or
         another moment is shown."""
+        self._spawn.follow()
         drag = self._drag
         if drag is None:
             return
@@ -266,6 +283,8 @@ class HandsPanel(PagePart[SessionView]):
             self._gizmo.position = tuple((known.pose[:3] + offset).tolist())
             self._gizmo.wxyz = tuple(known.pose[3:].tolist())
         self._draw_force(view)
+        body, height = ("", 0.0) if known is None else (known.body, float(known.pose[2]))
+        self._spawn.draw_in_view(view, body, height, offset)
 
     def _find(self, view: SessionView, poses: NDArray[np.float32]) -> Selected | None:
         task, body, env = view.task, self._body(), view.selected_env
@@ -379,6 +398,7 @@ class HandsPanel(PagePart[SessionView]):
 
     def let_go(self) -> None:
         """Cancel the drag."""
+        self._spawn.let_go()
         drag, self._drag = self._drag, None
         if drag is not None and drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))

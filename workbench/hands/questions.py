@@ -20,6 +20,8 @@ class Operand:
 
     at: Place
     """The expression where the operand is used."""
+    numbers: tuple[float, ...]
+    """Its value; empty if it is not known."""
     value: TracedValue | None
     """None if it could not be followed to where it is written."""
     why: str = ""

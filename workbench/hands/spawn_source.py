@@ -40,7 +40,8 @@ class AxisDraw:
 
     @property
     def range(self) -> Range:
-        ends = self.offset, self.offset + self.slope
+        # Rounded to a micrometre: single precision is not exact beyond it.
+        ends = [round(end, 6) + 0.0 for end in (self.offset, self.offset + self.slope)]
         return min(ends), max(ends)
 
 
@@ -95,8 +96,8 @@ def measure_spawn(starts: Sequence[EpisodeStart], row: int) -> Spawn | None:
         )
         for values in positions[there].T
     ]
-    low, high = positions[there].min(axis=0), positions[there].max(axis=0)
-    return Spawn(axes[0], axes[1], ((low[0], high[0]), (low[1], high[1])))
+    x, y = ((float(values.min()), float(values.max())) for values in positions[there].T)
+    return Spawn(axes[0], axes[1], (x, y))
 
 
 def _draws_of_all(starts: Sequence[EpisodeStart]) -> list[tuple[Draw, int, Floats]]:
@@ -214,6 +215,8 @@ def _edit_draw(changes: Changes, body: str, of_call: list[tuple[AxisDraw, Range]
         old_slope, old_offset = edits.slopes[axis.column], edits.offsets[axis.column]
         # Later code may scale and shift the coordinate: coordinate = scale * expression + shift.
         scale = axis.slope / old_slope
+        if not (draw.bounds or draw.operations) and abs(abs(scale) - 1) > 1e-4:
+            raise RefusedEdit(f"{_where(changes, draw.at)} is scaled in another place")
         shift = axis.offset - scale * old_offset
         begin, end = (low, high) if axis.slope > 0 else (high, low)
         slopes[axis.column] = (end - begin) / scale
@@ -234,13 +237,12 @@ class _Expression:
 
     def _numbers(self, operand: Operand) -> Floats:
         """(M,) value of an operand. Raises RefusedEdit."""
-        value, count = operand.value, self._draw.numbers.shape[1]
-        if value is None:
-            raise RefusedEdit(operand.why)
-        flat = value.value if isinstance(value.value, tuple) else (value.value,)
-        if len(flat) not in (1, count) or not all(isinstance(number, float) for number in flat):
+        count = self._draw.numbers.shape[1]
+        if not operand.numbers:
+            raise RefusedEdit(operand.why or f"{_where(self._changes, operand.at)} is not a list of numbers")
+        if len(operand.numbers) not in (1, count):
             raise RefusedEdit(f"{_where(self._changes, operand.at)} is not a number for each drawn number")
-        return np.broadcast_to(np.array(flat, np.float64), count)
+        return np.broadcast_to(np.array(operand.numbers, np.float64), count)
 
     def _base(self) -> tuple[Floats, Floats]:
         """Slopes and offsets before the operations."""
@@ -278,6 +280,8 @@ class _Expression:
             self._new = dict(zip(self._draw.bounds, (low, high, low), strict=False))
         else:
             self._solve(slopes, offsets)
+        if not all(np.isfinite(new).all() for new in self._new.values()):
+            raise RefusedEdit(f"{_where(self._changes, self._draw.whole)} multiplies a drawn number by 0")
         for operands in self._by_place():
             self._write(operands)
 
@@ -324,8 +328,8 @@ class _Expression:
         """The operands, those that are written at the same place together."""
         found: dict[Place, list[Operand]] = {}
         for operand in self._operands:
-            assert operand.value is not None, "`_numbers` has read it"
-            found.setdefault(_innermost(operand.value).at, []).append(operand)
+            place = operand.at if operand.value is None else _innermost(operand.value).at
+            found.setdefault(place, []).append(operand)
         return list(found.values())
 
     def _write(self, operands: list[Operand]) -> None:
@@ -334,10 +338,10 @@ class _Expression:
         if all(_same(self._old[operand], new) for operand, new in zip(operands, wanted, strict=True)):
             return
         value = operands[0].value
-        assert value is not None, "`_numbers` has read it"
         alike = all(_same(new, wanted[0]) for new in wanted)
-        shared = any(read.others is not None for read in value.reads)
-        if len(operands) == 1 or (alike and not shared):
+        if value is not None and (
+            len(operands) == 1 or (alike and not any(read.others for read in value.reads))
+        ):
             if isinstance(value.value, float) and np.ptp(wanted[0]) < 0.5 * 10**-DECIMALS:
                 if not self._with_other_sign(operands[0], float(wanted[0][0])):
                     self._changes.number(value, float(wanted[0][0]), DECIMALS)
@@ -400,7 +404,7 @@ class _Expression:
             self._changes.add_imports(self._file, {"torch": "import torch"})
         on_device = any(
             isinstance(outer, ast.With)
-            and any("torch.device(" in self._file.code(item) for item in outer.items)
+            and any("torch.device(" in self._file.code(item.context_expr) for item in outer.items)
             for outer in self._file.ancestors(self._call)
         )
         return f"{module or 'torch'}.tensor({written}{'' if on_device else ', device=self.device'})"

@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 
 from workbench.hands.questions import Draw, EpisodeStart, Operand, Operation, ReadStart
 from workbench.source.definitions import Project
-from workbench.source.parsed import Place, SourceFile, arguments
+from workbench.source.parsed import FUNCTIONS, Place, Plain, SourceFile, arguments
 from workbench.source.read_values import Unknown, ValueReader, running_call
 
 MAX_DRAWS, MAX_COLUMNS = 256, 64
@@ -92,7 +92,7 @@ def _draw(
     of_uniform: bool,
 ) -> Draw:
     """The draw of a call that `frame` is making."""
-    whole, steps = _expression_around(file, call)
+    whole, steps = _expression_around(project, file, call)
     bounds: tuple[ast.expr, ...] = ()
     if of_uniform:
         given = arguments(call, ("low", "high", "size", "device"))
@@ -103,10 +103,16 @@ def _draw(
     reader = ValueReader(project, file, call, frame, together=operands)
 
     def operand(node: ast.expr) -> Operand:
+        place = _place(file, node)
         try:
-            return Operand(_place(file, node), reader.part(file, node))
+            value = reader.part(file, node)
+            return Operand(place, _flat(value.value), value)
         except Unknown as exc:
-            return Operand(_place(file, node), None, str(exc))
+            why = str(exc)
+        try:
+            return Operand(place, _flat(reader.present_value(file, node)), None, why)
+        except Unknown:
+            return Operand(place, (), None, why)
 
     return Draw(
         _place(file, call),
@@ -118,13 +124,26 @@ def _draw(
     )
 
 
+def _flat(value: Plain) -> tuple[float, ...]:
+    """The numbers of a number or of a list of numbers; empty for any other value."""
+    numbers = value if isinstance(value, tuple) else (value,)
+    found = tuple(number for number in numbers if isinstance(number, float))
+    return found if len(found) == len(numbers) else ()
+
+
 def _expression_around(
-    file: SourceFile, call: ast.expr
+    project: Project, file: SourceFile, call: ast.expr
 ) -> tuple[ast.expr, list[tuple[Sign, ast.expr | None]]]:
-    """The arithmetic expression around a call, and its operations on the call's result, innermost first."""
+    """The arithmetic expression around a call, and its operations on the call's result, innermost first.
+
+    It continues where a name that the call is assigned to is read, if the name is assigned and read once.
+    """
     steps: list[tuple[Sign, ast.expr | None]] = []
     while True:
         outer = file.parents[call]
+        if isinstance(outer, ast.Assign) and (read := _only_reader(project, file, outer)) is not None:
+            call = read
+            continue
         if isinstance(outer, ast.BinOp) and type(outer.op) in _SIGNS:
             first, sign = outer.left is call, _SIGNS[type(outer.op)]
             if sign == "/" and not first:
@@ -141,6 +160,18 @@ def _expression_around(
         else:
             return call, steps
         call = outer
+
+
+def _only_reader(project: Project, file: SourceFile, assignment: ast.Assign) -> ast.expr | None:
+    """The name that reads what is assigned; None if there are several, or other assignments to it."""
+    scope, target = file.scopes(assignment)[0], assignment.targets[0]
+    if len(assignment.targets) > 1 or not isinstance(target, ast.Name) or not isinstance(scope, FUNCTIONS):
+        return None
+    if len(project.bindings(file, scope).get(target.id, ())) != 1:
+        return None
+    found = [node for node in ast.walk(scope) if isinstance(node, ast.Name) and node.id == target.id]
+    reads = [node for node in found if node is not target]
+    return reads[0] if len(reads) == 1 else None
 
 
 def _bounds_in(file: SourceFile, steps: list[tuple[Sign, ast.expr | None]]) -> tuple[ast.expr, ...]:

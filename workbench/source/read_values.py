@@ -53,6 +53,10 @@ _CONDITION_NODES = (
     ast.Not,
     ast.expr_context,
 )
+_PRESENT_NODES = (
+    *(ast.Name, ast.Attribute, ast.Subscript, ast.Constant, ast.List, ast.Tuple, ast.expr_context),
+    *(ast.BinOp, ast.operator, ast.UnaryOp, ast.unaryop),
+)
 _NAME_NODES = (ast.Name, ast.Attribute, ast.Subscript)
 Reads = tuple[Read, ...]
 _Made = TypeVar("_Made")
@@ -167,6 +171,12 @@ class ValueReader:
         return self._with_editable_number(file, node, TracedValue(place, reads, value))
 
     # --- values -------------------------------------------------------------------------------------
+
+    def present_value(self, file: SourceFile, node: ast.expr) -> Plain:
+        """The value of an expression of names and numbers, wherever they are defined. Raises Unknown."""
+        if not all(isinstance(inner, _PRESENT_NODES) for inner in ast.walk(node)):
+            raise self.computed(file, node)  # evaluating it again may have effects
+        return self._value(file, node)
 
     def _value(self, file: SourceFile, node: ast.expr) -> Plain:
         """The value of an expression that `_check` accepts."""
