@@ -135,7 +135,8 @@ class HandsPanel(PagePart[SessionView]):
             self._angles = self._row("Rotation", SetBodyAngle, ANGLES, "Degrees about fixed axes.", 1.0)
             self._scope = scope_choice(server)
             self._tools = server.gui.add_html("")
-            self._spawn = SpawnPanel(server, session)
+            self.spawn = SpawnPanel(server, session)
+            """The range in which resets put the selected body."""
             self._change = server.gui.add_html("", visible=False)
         self._grip = InView(self._add_grip, "dimensions", "position", "wxyz")
         self._gizmo = server.scene.add_transform_controls(
@@ -193,7 +194,7 @@ class HandsPanel(PagePart[SessionView]):
         spawn: Command = HideSpawn() if ranged else ShowSpawn()
         of_range = Tool("Spawn range", spawn, type(spawn).help(), on=ranged, off=bool(why))
         self._tools.content = tools_html([handles, of_range, write])
-        self._spawn.show(box, known.body)
+        self.spawn.show(box, known.body)
         edit = view.of(StartEdit)
         self._change.content, self._change.visible = start_edit_html(edit), edit.stage != "none"
         name_fold(self._fold, TITLE, known.body)
@@ -237,7 +238,7 @@ class HandsPanel(PagePart[SessionView]):
     def follow(self, view: SessionView) -> None:
         """Let go if the page that drags has closed, if the pulled env was reset, or if a body that is being moved plays or
         another moment is shown."""
-        self._spawn.follow()
+        self.spawn.follow()
         drag = self._drag
         if drag is None:
             return
@@ -284,7 +285,7 @@ class HandsPanel(PagePart[SessionView]):
             self._gizmo.wxyz = tuple(known.pose[3:].tolist())
         self._draw_force(view)
         body, height = ("", 0.0) if known is None else (known.body, float(known.pose[2]))
-        self._spawn.draw_in_view(view, body, height, offset)
+        self.spawn.draw_in_view(view, body, height, offset)
 
     def _find(self, view: SessionView, poses: NDArray[np.float32]) -> Selected | None:
         task, body, env = view.task, self._body(), view.selected_env
@@ -398,7 +399,7 @@ class HandsPanel(PagePart[SessionView]):
 
     def let_go(self) -> None:
         """Cancel the drag."""
-        self._spawn.let_go()
+        self.spawn.let_go()
         drag, self._drag = self._drag, None
         if drag is not None and drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))

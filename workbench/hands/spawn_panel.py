@@ -58,7 +58,7 @@ class SpawnPanel:
             for axis in AXES
         ]
         self._tools = server.gui.add_html("", visible=False)
-        self._lines = line_set(server, "/hands/spawn", COLOUR, 3.0)
+        self._lines = line_set(server, "/hands/spawn_box", COLOUR, 3.0)
         self._gizmos = {side: self._add(side) for side in SIDES}
         self._offset: Floats = np.zeros(3)
         self._drag: _Drag | None = None

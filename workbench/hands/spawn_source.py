@@ -277,6 +277,9 @@ class _Expression:
         if self._draw.bounds:
             scale, shift = self._applied(self._draw.operations, np.ones(len(slopes)), np.zeros(len(slopes)))
             low, high = (offsets - shift) / scale, (offsets + slopes - shift) / scale
+            if self._needs_columns(low, high):
+                self._write_width(low, high)
+                return
             self._new = dict(zip(self._draw.bounds, (low, high, low), strict=False))
         else:
             self._solve(slopes, offsets)
@@ -284,6 +287,20 @@ class _Expression:
             raise RefusedEdit(f"{_where(self._changes, self._draw.whole)} multiplies a drawn number by 0")
         for operands in self._by_place():
             self._write(operands)
+
+    def _needs_columns(self, low: Floats, high: Floats) -> bool:
+        """Whether ``(high - low) + low`` has one number where each column needs its own."""
+        one = any(len(bound.numbers) == 1 for bound in self._draw.bounds)
+        return len(self._draw.bounds) == 3 and one and not (_same(low, low[:1]) and _same(high, high[:1]))
+
+    def _write_width(self, low: Floats, high: Floats) -> None:
+        """Replace ``high - low`` and ``low`` by numbers for each column."""
+        file, node = self._changes.find(self._draw.bounds[0].at)
+        width = file.parents[node]
+        _, added = self._changes.find(self._draw.bounds[2].at)
+        for old, text in ((width, self._text(high - low)), (added, self._text(low))):
+            self._changes.note(f"`{file.one_line(old)}` became {text}.")
+            self._changes.replace(file, old, text)
 
     def _solve(self, slopes: Floats, offsets: Floats) -> None:
         """Choose the last factor, and the last number that is added after it."""
