@@ -15,6 +15,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.drive.scenes import step_of
+from workbench.envs.step_result import StepResult
 from workbench.hands.questions import EpisodeStart, ReadStart
 from workbench.hands.spawn_source import Range, Spawn, measure_spawn, plan_spawn
 from workbench.hands.start_worker import read_start
@@ -63,11 +65,12 @@ def starts_of(file: Path, text: str) -> list[EpisodeStart]:
     module = loaded(file, text)
     try:
 
-        def reset(seed: int) -> Callable[[], np.ndarray]:
-            def poses() -> np.ndarray:
+        def reset(seed: int) -> Callable[[], StepResult]:
+            def poses() -> StepResult:
                 torch.manual_seed(seed)
                 placed = module.Env().place(ENVS).numpy()
-                return np.concatenate([placed, np.zeros((ENVS, 4))], axis=1).astype(np.float32)[:, None]
+                rows = np.concatenate([placed, np.zeros((ENVS, 4))], axis=1).astype(np.float32)
+                return step_of(rows[:, None])
 
             return poses
 

@@ -225,6 +225,12 @@ class SetJoint(Command, frozen=True):
     """Degrees for a revolute joint, metres for a prismatic one."""
 
 
+class WriteQpos(Command, frozen=True):
+    """Show the change of the file that makes the robot begin with its present joint positions."""
+
+    robot: RobotName
+
+
 class UseKeyframe(Command, frozen=True):
     """Put the robot into this keyframe of its agent."""
 

@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.envs.robots import Joint, RobotDescription
-from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe
+from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe, WriteQpos
 from workbench.hands.joints import (
     keyframe_code,
     limits_text,
@@ -21,6 +21,8 @@ from workbench.hands.joints import (
 )
 from workbench.hands.link_poses import link_poses
 from workbench.hands.panel import scope_choice
+from workbench.hands.start_edit import RobotQpos, StartEdit
+from workbench.hands.start_panel import start_edit_html
 from workbench.hands.state import Hands
 from workbench.live.panels.run_panel import control_modes
 from workbench.live.view import SessionView
@@ -70,7 +72,8 @@ class JointsPanel(PagePart[SessionView]):
         shown = view.step_serial, view.task_serial, view.selected_env, view.timeline.shown, view.playing
         hands = view.of(Hands)
         moves = hands.dragged, hands.all_envs
-        return shown, view.settings.action_source, id(view.slider_action), moves, self._unfolded
+        edit = view.of(StartEdit)
+        return shown, view.settings.action_source, id(view.slider_action), moves, self._unfolded, edit
 
     def urgent(self, view: SessionView) -> object:
         return view.of(Hands).dragged, view.task_serial, view.playing, self._unfolded
@@ -103,6 +106,7 @@ class _RobotPart:
     def __init__(self, server: viser.ViserServer, robot: RobotDescription, alone: bool) -> None:
         self._robot, self._alone = robot, alone
         self._head = server.gui.add_html("")
+        self._change = server.gui.add_html("", visible=False)
         self._sliders: list[Field] = []
         for number, (joint, name) in enumerate(zip(robot.joints, short_names(robot.joints), strict=True)):
             self._sliders.append(
@@ -140,10 +144,18 @@ class _RobotPart:
             qpos=qpos_code(now),
             keyframe=keyframe_code(now, view.step.poses[env, root]),
         )
-        self._head.content = copies + (tools_html([label, *keyframes]) if keyframes else "")
+        write = Tool(
+            "Write into the file", WriteQpos(robot=robot.name), WriteQpos.help(), off=past or view.playing
+        )
+        rows = [[label, *keyframes], [write]] if keyframes else [[write]]
+        self._head.content = copies + tools_html(*rows)
+        edit = view.of(StartEdit)
+        shows = isinstance(edit.wanted, RobotQpos) and edit.wanted.of == robot.name
+        self._change.visible, self._change.content = shows, start_edit_html(edit)
 
     def remove(self) -> None:
         self._head.remove()
+        self._change.remove()
         for one in self._sliders:
             one.remove()
 

@@ -26,7 +26,7 @@ from workbench.hands.commands import (
 )
 from workbench.hands.spawn import SpawnAsked, SpawnBox
 from workbench.hands.spawn_panel import SpawnPanel
-from workbench.hands.start_edit import BodyPose, StartEdit, StartWanted
+from workbench.hands.start_edit import BodyPose, RobotQpos, StartEdit, StartWanted
 from workbench.hands.start_panel import start_edit_html
 from workbench.hands.state import (
     BodyMoved,
@@ -196,7 +196,8 @@ class HandsPanel(PagePart[SessionView]):
         self._tools.content = tools_html([handles, of_range, write])
         self.spawn.show(box, known.body)
         edit = view.of(StartEdit)
-        self._change.content, self._change.visible = start_edit_html(edit), edit.stage != "none"
+        of_body = edit.stage != "none" and not isinstance(edit.wanted, RobotQpos)
+        self._change.content, self._change.visible = start_edit_html(edit), of_body
         name_fold(self._fold, TITLE, known.body)
 
     def do(self, command: Command, visitor: Visitor) -> None:

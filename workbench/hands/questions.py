@@ -66,6 +66,8 @@ class EpisodeStart:
 
     poses: NDArray[np.float32]
     """(N, B, 7), as in `StepResult.poses`."""
+    qpos: NDArray[np.float32] | None
+    """(N, J), as in `StepResult.qpos`."""
     draws: tuple[Draw, ...]
     """In the order in which they were drawn."""
 

@@ -45,7 +45,17 @@ class SpawnRange:
     """Minimum and maximum in metres, in the env's frame; None keeps what the task does."""
 
 
-Beginning = BodyPose | SpawnRange
+@dataclass(frozen=True)
+class RobotQpos:
+    """Episodes begin with the joints of a robot at these positions, apart from noise that the task adds."""
+
+    of: str
+    """Name of the robot, as in `RobotDescription.name`."""
+    qpos: tuple[float, ...]
+    """A position for each of `RobotDescription.joints`, in rad or m."""
+
+
+Beginning = BodyPose | SpawnRange | RobotQpos
 
 
 @dataclass(frozen=True)
@@ -194,7 +204,7 @@ def _plan(edit: StartEdit, run: Run, wanted: Beginning) -> Change:
     if run.task is None or load is None:
         raise Refused("No task is loaded yet.")
     if run.playing and not isinstance(wanted, SpawnRange):
-        raise Refused("Pause first, and move the body to where it shall begin.")
+        raise Refused("Pause first, and move it to where it shall begin.")
     if edit.writing:
         raise Refused("Wait until the last change has loaded.")
     planning = StartEdit("planning", edit.number + 1, wanted, message="Running the task with the change ...")

@@ -13,6 +13,8 @@ from workbench.cameras.edit.plan_request import texts_on_disk
 from workbench.checks.state import load_version
 from workbench.hands.pose_source import lines_to_copy as pose_lines
 from workbench.hands.pose_source import plan_pose
+from workbench.hands.qpos_source import find_qpos, plan_qpos
+from workbench.hands.qpos_source import lines_to_copy as qpos_lines
 from workbench.hands.questions import EpisodeStart, ReadStart
 from workbench.hands.spawn_source import AXES, measure_spawn, plan_spawn, why_no_range
 from workbench.hands.spawn_source import lines_to_copy as spawn_lines
@@ -21,6 +23,7 @@ from workbench.hands.start_edit import (
     ChangeStartFile,
     CheckStart,
     PlanStart,
+    RobotQpos,
     SpawnRange,
     StartChecked,
     StartEffect,
@@ -41,7 +44,8 @@ from workbench.task.write_edits import SourceEdit, apply, revert, why_not_writab
 Poses = NDArray[np.float64]
 POSITION_TOLERANCE_METRES = 2e-4
 ANGLE_TOLERANCE_RADIANS = 4e-4
-"""Tolerances that cover the rounding of written numbers."""
+QPOS_TOLERANCE = 1e-3
+"""Tolerances that cover the rounding of written numbers; of joints, in rad or m, also how well a reset sets them."""
 
 
 class StartJobs:
@@ -96,15 +100,17 @@ class StartJobs:
         for change in edit.changes:
             if why := await self._aside.run(partial(why_not_writable, change.file)):
                 raise RefusedEdit(why)
-        texts |= {change.file: change.new_text for change in edit.changes}
+        old_texts, texts = texts, texts | {change.file: change.new_text for change in edit.changes}
         new = {change.file: plain_line_ends(change.new_text) for change in edit.changes}
         changed = replace(effect.load, source={**task.source, **new})
         after = await self._read(job, changed, effect.seeds, texts)
         if after[0].poses.shape != before[0].poses.shape:
             raise RefusedEdit("the change would add or remove bodies")
-        if why := difference(after, task, wanted):
+        unlike = partial(_unlike, before, after, task, wanted, old_texts)
+        if why := difference(after, task, wanted) or await self._aside.run(unlike):
             raise RefusedEdit(f"a run of the changed file shows: {why}")
-        others = _moved(before, after, task, wanted.of)
+        # The links of a robot move with its joints.
+        others = [] if isinstance(wanted, RobotQpos) else _moved(before, after, task, wanted.of)
         if others:
             note = f"{', '.join(others)} will begin elsewhere too."
             edit = replace(edit, notes=(*edit.notes, note))
@@ -112,8 +118,11 @@ class StartJobs:
 
     async def _check(self, job: Job, effect: CheckStart) -> None:
         task, wanted = effect.task, effect.wanted
-        why = f"The new version has no body {wanted.of}"
-        if wanted.of in task.geometry.body_names:
+        names = [robot.name for robot in task.robots]
+        if not isinstance(wanted, RobotQpos):
+            names = list(task.geometry.body_names)
+        why = f"The new version has no {wanted.of}"
+        if wanted.of in names:
             starts = await self._read(job, effect.load, effect.seeds, task.source)
             why = difference(starts, task, wanted)
         self._happen(StartChecked(effect.number, why))
@@ -151,7 +160,9 @@ class StartJobs:
 def _planned(
     texts: Mapping[str, str], task: TaskDescription, before: Sequence[EpisodeStart], wanted: Beginning
 ) -> SourceEdit:
-    """The change that does what is wanted; see `plan_pose` and `plan_spawn`. Raises RefusedEdit."""
+    """The change that does what is wanted; see `plan_pose`, `plan_spawn` and `plan_qpos`. Raises RefusedEdit."""
+    if isinstance(wanted, RobotQpos):
+        return plan_qpos(find_qpos(texts, _qpos_of(before, task, wanted)), wanted.qpos)
     row = task.geometry.body_names.index(wanted.of)
     if isinstance(wanted, SpawnRange):
         spawn = measure_spawn(before, row)
@@ -169,7 +180,34 @@ def _planned(
 def _lines_to_copy(wanted: Beginning) -> str:
     if isinstance(wanted, SpawnRange):
         return spawn_lines(wanted.of, (wanted.x, wanted.y))
+    if isinstance(wanted, RobotQpos):
+        return qpos_lines(wanted.qpos)
     return pose_lines("", wanted.pose)
+
+
+def _qpos_of(starts: Sequence[EpisodeStart], task: TaskDescription, wanted: RobotQpos) -> Poses:
+    """(K, J) joint positions of the robot in all envs. Raises RefusedEdit if there is no such robot."""
+    robot = next((one for one in task.robots if one.name == wanted.of), None)
+    rows = [start.qpos for start in starts if start.qpos is not None]
+    if robot is None or len(rows) < len(starts) or len(robot.joints) != len(wanted.qpos):
+        raise RefusedEdit(f"no robot {wanted.of} with {len(wanted.qpos)} joints begins here")
+    return np.concatenate(rows)[:, [joint.column for joint in robot.joints]].astype(np.float64)
+
+
+def _unlike(
+    before: Sequence[EpisodeStart],
+    after: Sequence[EpisodeStart],
+    task: TaskDescription,
+    wanted: Beginning,
+    texts: Mapping[str, str],
+) -> str:
+    """How the joints of a robot follow the changed numbers, as text; empty if each moves by the change of its number."""
+    if not isinstance(wanted, RobotQpos):
+        return ""
+    old = _qpos_of(before, task, wanted)
+    changes = np.array(wanted.qpos) - find_qpos(texts, old).values
+    apart = np.abs(_qpos_of(after, task, wanted) - old - changes).max()
+    return f"{wanted.of} begins {apart:.3g} from where the numbers put it" if apart > QPOS_TOLERANCE else ""
 
 
 def _poses_of(starts: Sequence[EpisodeStart], row: int) -> Poses:
@@ -190,6 +228,11 @@ def _moved(
 
 def difference(starts: Sequence[EpisodeStart], task: TaskDescription, wanted: Beginning) -> str:
     """How the first moments of episodes differ from what is wanted, as text; empty if they do not."""
+    if isinstance(wanted, RobotQpos):
+        rows = _qpos_of(starts, task, wanted)
+        # A task may add noise to what is written.
+        apart = np.abs(rows.mean(axis=0) - wanted.qpos) - np.ptp(rows, axis=0)
+        return f"{wanted.of} begins with other joint positions" if apart.max() > QPOS_TOLERANCE else ""
     row = task.geometry.body_names.index(wanted.of)
     if isinstance(wanted, SpawnRange):
         return _other_ranges(starts, row, wanted)

@@ -15,6 +15,7 @@ from mani_skill.envs.utils.randomization import uniform
 from numpy.typing import NDArray
 from torch.overrides import TorchFunctionMode
 
+from workbench.envs.step_result import StepResult
 from workbench.hands.questions import Draw, EpisodeStart, Operand, Operation, ReadStart
 from workbench.source.definitions import Project
 from workbench.source.parsed import FUNCTIONS, Place, Plain, SourceFile, arguments
@@ -29,18 +30,18 @@ _UNCHANGED = ("to", "float", "clone")
 _TORCH = str(Path(torch.__file__).parent)
 
 
-def read_start(question: ReadStart, num_envs: int, reset: Callable[[], NDArray[np.float32]]) -> EpisodeStart:
+def read_start(question: ReadStart, num_envs: int, reset: Callable[[], StepResult]) -> EpisodeStart:
     """Reset, and record what is drawn.
 
     Args:
-        reset: resets all envs; returns the poses (N, B, 7).
+        reset: resets all envs.
 
     Raises:
         RefusedEdit: one of the texts is not Python.
     """
     with _Recorder(question.texts, num_envs) as recorder:
-        poses = reset()
-    return EpisodeStart(poses, tuple(recorder.draws))
+        step = reset()
+    return EpisodeStart(step.poses, step.qpos, tuple(recorder.draws))
 
 
 class _Recorder(TorchFunctionMode):

@@ -19,10 +19,12 @@ from workbench.hands.commands import (
     ToggleDriving,
     ToggleReach,
     UseKeyframe,
+    WriteQpos,
 )
 from workbench.hands.drive_keys import GRIPPER_KEY, bindings, driven_action, gripper
 from workbench.hands.joints import position_of
 from workbench.hands.reach import ArmDragged, ArmsReleased, Reach
+from workbench.hands.start_edit import RobotQpos, StartWanted
 from workbench.live.commands import PlayRun
 from workbench.live.effects import Asked, Later, Then
 from workbench.live.events import EnvsReset, PagesCounted, Send, SettingsChanged, VersionLoaded, WorkerDied
@@ -52,6 +54,7 @@ DOES: frozenset[type[Command]] = frozenset(
         DragJoint,
         SetJoint,
         UseKeyframe,
+        WriteQpos,
     }
 )
 """Commands that `apply` handles."""
@@ -168,6 +171,8 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
             return _set_joint(hands, run, robot, joint, to, ends=True)
         case Asked(command=UseKeyframe(robot=robot, name=name)):
             return hands, [_use_keyframe(hands, run, robot, name)]
+        case Asked(command=WriteQpos(robot=robot)):
+            return hands, [Then(StartWanted(_qpos_now(run, robot)))]
         case Stepped() | TaskFailed() | VersionLoaded() | PagesCounted() | WorkerDied() if hands.dragged:
             return apply(replace(hands, dragged=None), event, run, recorded)
         case Asked(command=BeginAgain() | DiscardEpisode() | KeepEpisode() as command):
@@ -403,6 +408,15 @@ def _use_keyframe(hands: Hands, run: Run, name: str, keyframe: str) -> Send:
             name, envs_of_move(hands, run.env, run.num_envs), every, found.qpos, found.root, how, _newest(run)
         )
     )
+
+
+def _qpos_now(run: Run, name: str) -> RobotQpos:
+    robot = _robot_of(run, name)
+    assert run.step is not None, "there is a live moment"
+    if run.step.qpos is None:
+        raise Refused("The task has no joints.")
+    columns = [joint.column for joint in robot.joints]
+    return RobotQpos(name, tuple(map(float, run.step.qpos[run.env, columns])))
 
 
 def why_not_driven(control_mode: str | None, joint: str) -> str:

@@ -563,7 +563,7 @@ class Worker:
             return read_start(
                 question,
                 opened.env.num_envs,
-                lambda: self._reset_envs(opened, None, question.seed).poses,
+                lambda: self._reset_envs(opened, None, question.seed),
             )
         except RefusedEdit as refused:
             raise CannotAnswer(refused.reason) from refused
