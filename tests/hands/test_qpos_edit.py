@@ -12,7 +12,7 @@ import pytest
 from tests.drive.session import TASKS, jump, live_session, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import RevertStartChange, SaveStartChange, SetJoint, WriteQpos
-from workbench.hands.qpos_source import find_qpos, plan_qpos
+from workbench.hands.qpos_source import find_qpos, plan_qpos, without_noise
 from workbench.hands.start_edit import StartEdit
 from workbench.page.command import Refused
 from workbench.source.parsed import RefusedEdit
@@ -69,6 +69,13 @@ def test_only_the_positions_that_change_are_replaced() -> None:
     assert plan_qpos(written, (0.25, np.pi * 3 / 8, 0.0)).new_text == text.replace("[0.0", "[0.25")
     with pytest.raises(RefusedEdit):
         plan_qpos(written, (0.00001, np.pi * 3 / 8, 0.0))
+
+
+def test_noise_of_the_present_episode_is_not_written() -> None:
+    text = "qpos = [0.0, 1.2, 0.0]\n"
+    written = find_qpos({FILE: text}, REST)
+    to = without_noise(written, REST, (0.5, 1.23, 0.0))
+    assert plan_qpos(written, to).new_text == "qpos = [0.5, 1.2, 0.0]\n"
 
 
 REFUSED = {

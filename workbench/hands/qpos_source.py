@@ -74,7 +74,19 @@ def find_qpos(texts: Mapping[str, str], rows: Floats) -> WrittenQpos:
     return found[0]
 
 
-def plan_qpos(written: WrittenQpos, wanted: Sequence[float]) -> SourceEdit:
+def without_noise(written: WrittenQpos, rows: Floats, wanted: Sequence[float]) -> Floats:
+    """(J,) numbers to write: the old number where the wanted position is one that resets give anyway.
+
+    So the noise of the present episode is not written for joints that nobody moved.
+
+    Args:
+        rows: (K, J) as in `find_qpos`.
+    """
+    is_noise = (rows.min(axis=0) <= wanted) & (wanted <= rows.max(axis=0))
+    return np.where(is_noise, written.values, wanted)
+
+
+def plan_qpos(written: WrittenQpos, wanted: Sequence[float] | Floats) -> SourceEdit:
     """Plan the edit that writes (J,) other joint positions. Raises RefusedEdit if nothing changes."""
     changes = [
         Replacement(*written.file.span(item), number_text(to, DECIMALS, written.file.code(item)))

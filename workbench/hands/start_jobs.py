@@ -13,7 +13,7 @@ from workbench.cameras.edit.plan_request import texts_on_disk
 from workbench.checks.state import load_version
 from workbench.hands.pose_source import lines_to_copy as pose_lines
 from workbench.hands.pose_source import plan_pose
-from workbench.hands.qpos_source import find_qpos, plan_qpos
+from workbench.hands.qpos_source import find_qpos, plan_qpos, without_noise
 from workbench.hands.qpos_source import lines_to_copy as qpos_lines
 from workbench.hands.questions import EpisodeStart, ReadStart
 from workbench.hands.spawn_source import AXES, measure_spawn, plan_spawn, why_no_range
@@ -162,7 +162,9 @@ def _planned(
 ) -> SourceEdit:
     """The change that does what is wanted; see `plan_pose`, `plan_spawn` and `plan_qpos`. Raises RefusedEdit."""
     if isinstance(wanted, RobotQpos):
-        return plan_qpos(find_qpos(texts, _qpos_of(before, task, wanted)), wanted.qpos)
+        rows = _qpos_of(before, task, wanted)
+        written = find_qpos(texts, rows)
+        return plan_qpos(written, without_noise(written, rows, wanted.qpos))
     row = task.geometry.body_names.index(wanted.of)
     if isinstance(wanted, SpawnRange):
         spawn = measure_spawn(before, row)
@@ -205,7 +207,8 @@ def _unlike(
     if not isinstance(wanted, RobotQpos):
         return ""
     old = _qpos_of(before, task, wanted)
-    changes = np.array(wanted.qpos) - find_qpos(texts, old).values
+    written = find_qpos(texts, old)
+    changes = without_noise(written, old, wanted.qpos) - written.values
     apart = np.abs(_qpos_of(after, task, wanted) - old - changes).max()
     return f"{wanted.of} begins {apart:.3g} from where the numbers put it" if apart > QPOS_TOLERANCE else ""
 
