@@ -18,7 +18,7 @@ from workbench.live.view import SessionView
 from workbench.machine.loop import post
 from workbench.page.scene.env_grid import line_set
 from workbench.page.widgets.fields import Field
-from workbench.page.widgets.notices import refusals_told
+from workbench.page.widgets.notices import refusals_shown
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tools_html
 
@@ -129,7 +129,7 @@ class SpawnPanel:
 
     def _dragged(self, side: Side, client: viser.ClientHandle | None, phase: str, position: Floats) -> None:
         if client is not None:
-            with refusals_told(client, then=self.let_go):
+            with refusals_shown(client, then=self.let_go):
                 self.drag(client.client_id, side, phase, position)
 
     def drag(self, client: int, side: Side, phase: str, position: Floats) -> None:
