@@ -116,6 +116,31 @@ def test_a_spring_lifts_the_body_to_the_pointer_and_lets_go(session: Session) ->
     assert body(session, "cube")[1, 2] < 0.05 and session.view().pulled is None
 
 
+def test_a_body_that_is_held_at_a_corner_swings_and_is_not_shaken(session: Session) -> None:
+    fresh(session)
+    x, y, _ = (float(value) for value in body(session, "cube")[1, :3])
+    session.happen(BodyPulled(PullBody("cube", 1, (0.02, 0.02, 0.02), (x, y, 0.3))))
+    step(session, 20)
+    newtons = []
+    for _ in range(20):
+        step(session)
+        newtons.append(session.view().pulled.newtons)
+    session.happen(BodyPulled(PullBody()))
+    assert body(session, "cube")[1, 2] > 0.2 and max(newtons) < 2 * 0.064 * 9.81, "about its weight"
+
+
+def test_a_body_that_a_hand_throws_is_no_mistake_of_the_task(session: Session) -> None:
+    fresh(session)
+    session.happen(BodyPulled(PullBody("cube", 1, (0.0, 0.0, 0.0), (0.0, 30.0, 10.0))))
+    step(session, 3)
+    before = body(session, "cube")[1, 1]
+    step(session)
+    session.happen(BodyPulled(PullBody()))
+    step(session)
+    assert body(session, "cube")[1, 1] - before > 1.0, "faster than 20 m/s"
+    assert not session.view().odd and not session.view().env_table.outliers
+
+
 def test_a_link_is_pulled_with_the_weight_of_its_arm(session: Session) -> None:
     fresh(session)
     hand = "panda/panda_hand"

@@ -26,7 +26,8 @@ from workbench.live.messages import MoveBody, MoveJoints, PullBody
 from workbench.task.description import Pulled, Restored
 
 STIFFNESS = 400.0
-"""Newtons per metre and kilogram: a critically damped spring of 20 rad/s. It holds a body 2.5 cm below the target."""
+"""Newtons per metre and kilogram of effective mass: a critically damped spring of 20 rad/s. It holds a body 2.5 cm below
+the target."""
 MAX_ACCELERATION = 200.0
 """Bound of the spring's force, in newtons per kilogram, so that a far target does not throw the body through a wall."""
 
@@ -151,8 +152,9 @@ class _Spring:
     """SAPIEN's component of the body."""
     row: int
     """The body's row in the tensors of the simulation."""
-    mass: float
-    """Kilograms; for a link, the mass of its whole articulation, which moves with it."""
+    mass: NDArray[np.float64]
+    """(3, 3) effective mass at the grabbed point in kg, in the body's frame. A force on a point far from the centre also turns
+    the body: with the mass of the whole body, the spring would be too stiff there and throw the body about."""
     grabbed: NDArray[np.float64]
     target: NDArray[np.float64]
     newtons: list[float] = field(default_factory=list)
@@ -173,7 +175,8 @@ class _Spring:
         size = float(np.linalg.norm(pull))
         if not np.isfinite(size):
             return
-        force = self.mass * pull * min(1.0, MAX_ACCELERATION / max(size, 1e-9))
+        turn = pose.to_transformation_matrix()[:3, :3].astype(np.float64)
+        force = turn @ self.mass @ turn.T @ pull * min(1.0, MAX_ACCELERATION / max(size, 1e-9))
         self.newtons.append(float(np.linalg.norm(force)))
         for tensor, value in (
             (px.cuda_rigid_body_force, force),
@@ -198,9 +201,36 @@ def _spring(env: Any, request: PullBody) -> _Spring | None:
     if entity is None or index.kinds[body] not in ("dynamic", "link") or row is None:
         return None
     component = entity.find_component_by_type(physx.PhysxRigidBodyComponent)
-    if index.kinds[body] == "link":
-        mass = sum(link.mass for link in component.articulation.links)
-    else:
-        mass = component.mass
     grabbed, target = (np.array(point, np.float64) for point in (request.grabbed, request.target))
-    return _Spring(env.scene.px, component, row, float(mass), grabbed, target)
+    mass = _link_mass if index.kinds[body] == "link" else _free_mass
+    return _Spring(env.scene.px, component, row, mass(component, grabbed), grabbed, target)
+
+
+def _free_mass(component: Any, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) effective mass in kg of a free body at a point (3,), both in the body's frame."""
+    centre = component.cmass_local_pose
+    turn = centre.to_transformation_matrix()[:3, :3].astype(np.float64)
+    arm = _cross_matrix(point - centre.p)
+    turning = turn @ np.diag(1 / component.inertia) @ turn.T
+    return np.linalg.inv(np.eye(3) / component.mass + arm.T @ turning @ arm)
+
+
+def _link_mass(component: Any, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) effective mass in kg of a link at a point (3,), both in the link's frame, with free joints: inverse of
+    J M^-1 J^T (Khatib 1987, the operational space inertia). In directions in which the joints hardly let the point move, it
+    is the mass of the whole articulation."""
+    robot = component.articulation
+    total = sum(link.mass for link in robot.links)
+    mobility = np.eye(3) * (0.0 if robot.root.joint.type == "fixed" else 1 / total)
+    if robot.dof:
+        model, qpos = robot.create_pinocchio_model(), robot.qpos
+        jacobian = model.compute_single_link_local_jacobian(qpos, component.index)
+        linear = jacobian[:3] - _cross_matrix(point) @ jacobian[3:]
+        mobility += linear @ np.linalg.solve(model.compute_generalized_mass_matrix(qpos), linear.T)
+    values, directions = np.linalg.eigh(mobility)
+    return directions @ np.diag(1 / np.maximum(values, 1 / total)) @ directions.T
+
+
+def _cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) matrix M with ``M @ w == np.cross(v, w)``."""
+    return np.cross(np.eye(3), v)
