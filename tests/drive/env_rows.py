@@ -28,6 +28,7 @@ def rows_of(**changes: object) -> EnvRows:
         },
         "rewards": rewards,
         "outliers": {5: (FELL,)},
+        "by_hand": np.zeros(6, bool),
         "last": LastEpisode(
             np.array([1, 0, 0, 0, 2, 0], np.int8),
             np.array([41, -1, -1, -1, 9, -1], np.int32),

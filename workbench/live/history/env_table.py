@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.envs.gpu_rules import Finding
-from workbench.envs.outliers import Outlier, OutlierSighting, OutlierWatch
+from workbench.envs.outliers import Outlier, OutlierKind, OutlierSighting, OutlierWatch
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 from workbench.task.description import Restored, Stepped
@@ -78,6 +78,9 @@ class EnvRows:
     Keys are the names of bool entries of ``evaluate``, and `OutlierKind` values, even if their rule is
     off."""
     outliers: Outliers
+    by_hand: NDArray[np.bool_]
+    """(N,) whether a person moved or pulled a body in the present episode. What flies or falls then is not the task's
+    mistake."""
     last: LastEpisode
     ended: NDArray[np.int64]
     """(N,) number of episodes that ended since the task was loaded."""
@@ -149,6 +152,7 @@ class EnvTable:
             followed=np.full(count, self._has_reward),
             first={},
             outliers={},
+            by_hand=np.zeros(count, bool),
             last=LastEpisode(zero, never, nothing, {}),
             ended=none,
             succeeded=none,
@@ -176,14 +180,24 @@ class EnvTable:
             self._begin(begun if stepped.resumed else jumped | begun, step)
             if stepped.restored is not None and then is not None:
                 self._put_back(stepped.restored, then, rewards_then)
+            if stepped.restored is not None and stepped.restored.moved:
+                self._note_hand(stepped.restored.env_idx)
             return self._now
         moved = step.elapsed_steps != self._now.steps + 1
         if moved.any():
             self._begin(moved, step)
         self._rewards[:, self._tick % KEPT_REWARDS] = step.reward if self._has_reward else np.nan
         self._tick += 1
+        if stepped.pulled is not None:
+            self._note_hand((stepped.pulled.env,))
         self._step(step)
         return self._now
+
+    def _note_hand(self, env_idx: Sequence[int]) -> None:
+        if not self._now.by_hand[list(env_idx)].all():
+            by_hand = self._now.by_hand.copy()
+            by_hand[list(env_idx)] = True
+            self._now = replace(self._now, by_hand=by_hand)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -204,6 +218,10 @@ class EnvTable:
         for name, so in _flags(step):
             _note_first(first, name, so, step)
         for sight in self._watch.check(step):
+            if sight.kind.rule == OutlierKind.FAST.rule:
+                sight = replace(sight, envs=sight.envs & ~now.by_hand)
+                if not sight.envs.any():
+                    continue
             new = _note_first(first, sight.kind, sight.envs, step)
             if sight.kind.rule is not None and not self._break(sight.kind.rule, sight, step):
                 continue
@@ -265,6 +283,7 @@ class EnvTable:
             followed=np.where(envs, from_start & self._has_reward, now.followed),
             first=first,
             outliers=_merged(envs, {}, now.outliers),
+            by_hand=now.by_hand & ~envs,
             last=now.last.with_envs(worth_keeping, before) if worth_keeping.any() else now.last,
         )
         self._rewards[envs] = np.nan
@@ -288,6 +307,7 @@ class EnvTable:
             end=taken(now.end, then.end),
             total=taken(now.total, then.total),
             followed=taken(now.followed, then.followed),
+            by_hand=taken(now.by_hand, then.by_hand),
             first={what: taken(steps, then.first.get(what)) for what, steps in now.first.items()},
             outliers=_merged(
                 put, {env: then.outliers.get(int(source[env]), ()) for env in restored.env_idx}, now.outliers
