@@ -84,6 +84,19 @@ def test_an_invalid_step_ends_the_recording_with_a_message_and_keeps_the_thread(
         stop_listening(notices.append)
 
 
+def test_the_previous_episode_is_the_last_one_with_a_step_however_often_the_env_was_reset(
+    tmp_path: Path,
+) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.play(0)
+        fake.step(3)
+        for _ in range(3):
+            fake.reset()
+        fake.step(2)
+        fake.session.happen(SaveWanted((0,), before=True))
+        assert not fake.view.of(RecordingStatus).saving.failed
+
+
 def test_a_refusal_to_save_the_past_is_shown_only_where_it_applies(tmp_path: Path) -> None:
     with fake_worker_session(tmp_path, history_bytes=20_000) as fake:
         fake.session.happen(SaveWanted((0,)))

@@ -382,6 +382,20 @@ def test_a_listed_file_asks_once_with_its_text_and_modules(tmp_path: Path) -> No
     assert len(person.asked) == 2 and person.asked[1].files[0].since is Since.CHANGED
 
 
+def test_a_refusal_of_all_is_not_asked_again_and_a_refusal_of_one_is_for_its_text_only(foreign: Path) -> None:
+    info = info_of(foreign)
+    infos = [
+        replace(info, source={file: f"{text}# {number}\n" for file, text in info.source.items()})
+        for number in (1, 2, 2, 3)
+    ]
+    codes = [CodeToRun(reference_of(one), one, recorded_text=True) for one in infos]
+    for answer, questions in ((Consent.NONE, 1), (Consent.NO, 3)):
+        person = Answering(answer)
+        cleared = Clearances(ask=person).clear_all(codes)
+        assert all(isinstance(one, NotCleared) for one in cleared) and len(cleared) == len(codes)
+        assert [question.more for question in person.asked] == [2, 1, 0][:questions]
+
+
 def test_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
     file, person = listed(tmp_path), Answering(Consent.NO)
     clearances = Clearances(ask=person)
