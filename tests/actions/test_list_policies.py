@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from workbench.actions.policy import find_policy, list_policies
+from tests.drive.waiting import TIMEOUT_SECONDS
+from workbench.actions.policy import PolicyFile, find_policy, list_policies
 
 POLICIES = """
 raise RuntimeError("reading runs nothing")
@@ -46,6 +49,24 @@ def test_what_is_beside_the_task_is_listed_as_it_is_found(tmp_path: Path, monkey
         task / "same.py",
     ]
     assert list_policies(here, here) == ("same.py:act",)
+
+
+@pytest.mark.parametrize("saved", ["here", "task"])
+def test_a_save_of_the_policy_is_noticed_here_and_beside_the_task(
+    saved: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("here", "task"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / saved / "act.py").write_text("def act(obs): ...\n")
+    noticed = threading.Event()
+    file = PolicyFile(noticed.set)
+    try:
+        file.follow("act.py:act", tmp_path / "task")
+        (tmp_path / saved / "act.py").write_text("def act(obs): return 0\n")
+        assert noticed.wait(TIMEOUT_SECONDS)
+    finally:
+        file.close()
 
 
 @given(st.text(max_size=80))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 
 from tests.drive.episodes import made, poses_of, write
 from tests.drive.waiting import until
+from workbench.envs.camera_data import CameraSettings, MovedCamera
 from workbench.episodes.episode import Episode
 from workbench.episodes.row import UnreadableRecording
 from workbench.library.folder import Library
@@ -33,8 +35,9 @@ from workbench.review.commands import (
     SelectRecording,
     SwapWithFirst,
 )
+from workbench.review.panel import facts_html
 from workbench.review.playback import Review
-from workbench.review.view import PictureReader, ReviewView, column_at, curves, find_events
+from workbench.review.view import Opened, PictureReader, ReviewView, column_at, curves, find_events
 
 
 @dataclass(frozen=True)
@@ -450,6 +453,22 @@ def test_an_incomplete_and_a_broken_recording(child_process: None, tmp_path: Pat
     half, broken = view.problems
     assert rows[1].name in half and rows[2].name in broken
     library.close()
+
+
+def test_what_is_known_of_a_recording_is_among_its_facts() -> None:
+    def facts(changed: str = "", **info: Any) -> str:
+        return facts_html(Opened("id", "push", made(2, **info), ()), changed)
+
+    lens = CameraSettings((0.3, 0, 0.625), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+    moved = MovedCamera(1, "sensor", "wrist_view", lens, replace(lens, position=(0.3, 0, 0.875)))
+    known = {
+        "moved_cameras": ((moved,), "wrist_view"),
+        "acted_by": (((0, "lab.py:act"),), "lab.py:act"),
+        "observed_by": ("rgbd_view", "rgbd_view"),
+    }
+    for field_name, (value, shown) in known.items():
+        assert shown not in facts() and shown in facts(**{field_name: value}), field_name
+    assert "and evaluate" in facts("and evaluate")
 
 
 def test_events_of_an_episode_are_where_an_entry_becomes_true() -> None:
