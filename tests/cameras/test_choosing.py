@@ -11,7 +11,7 @@ from tests.drive.live import Live
 from tests.drive.scenes import camera, running
 from tests.drive.tabs import camera_message, handshake
 from tests.drive.waiting import until
-from workbench.cameras.commands import ChooseCamera, MoveCameraToView
+from workbench.cameras.commands import ChooseAxes, ChooseCamera, ChooseHandles, MoveCameraToView
 from workbench.cameras.events import CameraChosen
 from workbench.cameras.studio_panel import NO_CAMERA, TAB
 from workbench.cameras.view import StudioCamera, StudioView
@@ -44,6 +44,21 @@ def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
     assert live_page.client.notices == ["There is no camera gone · sensor."]
     live_page.do(MoveCameraToView())
     assert live_page.client.notices[1:] == ["First choose a camera that can be placed."]
+
+
+def test_axes_are_offered_for_the_handles_of_the_pose_only(live_page: Live) -> None:
+    """The handles at eye and target have the axes of the world."""
+    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+    info = replace(camera("base_camera"), settings=at)
+    view = running(
+        1, studio=StudioView(cameras=(StudioCamera(info.key, info, at, False, None),), selected=info.key)
+    )
+    tab = live_page.part(TAB)
+    for look_at in (False, True, False):
+        live_page.do(ChooseHandles(look_at=look_at))
+        live_page.show(view)
+        offered = [tab.presses(ChooseAxes(own=own)) for own in (False, True)]
+        assert any(offered) == (not look_at)
 
 
 def test_the_frustum_is_hidden_while_a_page_looks_from_the_cameras_place(live_page: Live) -> None:
