@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -36,7 +36,8 @@ from workbench.cameras.commands import (
     UndoCamera,
     UsePlacement,
 )
-from workbench.cameras.state import Change, Studio, placed_cameras, view_of
+from workbench.cameras.edit_state import apply_to_edits
+from workbench.cameras.state import Change, Edits, Studio, placed_cameras, view_of
 from workbench.cameras.view import EditRequest, EditState, PickedPixel
 from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.commands import Step
@@ -251,3 +252,12 @@ def test_only_the_shown_change_can_be_saved(moved: CameraSettings, back: bool) -
     else:
         with pytest.raises(Refused):
             apply(studio, Asked(SaveCameraChange()), run, now)
+
+
+@pytest.mark.parametrize("file", [Path("copy.py"), None])
+def test_a_copy_of_the_task_has_none_of_the_edits_that_were_made_in_the_original(file: Path | None) -> None:
+    """Else Revert would change the original, which is open no more."""
+    done = (EditState("checked", edit=EDIT),)
+    studio = Studio(edits=Edits(done=done, busy=True))
+    copied, _ = apply_to_edits(studio, of.TaskCopied(file, EditState("refused")), cast(Any, None))
+    assert (copied.edits.done, copied.edits.copied) == ((), file) if file else (done, None)
