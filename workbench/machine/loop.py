@@ -240,7 +240,7 @@ class BlockingPool:
     def close(self, within: float | None = None) -> None:
         """End the thread when all queued work is done, and wait for that up to `within` seconds (None: for
         ever). Must not be called on the loop's thread."""
-        self.end()
+        do(self.end)  # on the loop, where `begin` may be about to start the thread
         if self._thread is not None:
             self._thread.join(within)
 
