@@ -229,6 +229,34 @@ def test_an_event_of_an_env_is_found_in_earlier_episodes_too(played: FakeWorkerS
     assert session.view().env_table is not None and session.view().env_table.failed.tolist() == [0, 1, 0]
 
 
+def test_an_end_at_the_time_limit_is_no_fail(fake: FakeWorkerSession) -> None:
+    session = fake.session
+    fake.play(1)
+    fake.step(fail=(1,))
+    failed = fake.view.timeline.last
+    fake.reset((1,))
+    fake.step(truncated=(1,))
+    limit = fake.view.timeline.last
+    session.happen(EnvEventShown(1, "failed"))
+    assert at(fake) == failed
+    session.happen(EnvEventShown(1, "limit"))
+    assert at(fake) == limit
+
+
+@pytest.mark.parametrize("driven", [False, True])
+def test_the_time_limit_does_not_end_a_driven_episode(fake: FakeWorkerSession, driven: bool) -> None:
+    if driven:
+        fake.session.change(action_source="sliders", episode_end="continue")
+    fake.play(1)
+    for _ in range(2):
+        fake.step(truncated=(1,), reward=(1, 1, 1))
+    table = fake.session.env_rows()
+    assert (table.end[1], table.ended[1]) == ((-1, 0) if driven else (2, 1))
+    assert (table.total[1] == table.total[0]) == driven, "the return goes on"
+    fake.step(fail=(1,))
+    assert fake.session.env_rows().failed.tolist() == [0, int(driven), 0]
+
+
 def test_an_episode_that_a_task_ends_by_a_rule_of_its_own_failed(fake: FakeWorkerSession) -> None:
     fake.play(1)
     fake.step(evaluate={}, fail=(2,))

@@ -447,7 +447,9 @@ def _stepped(run: Run, event: Stepped) -> Run:
     recovery = run.recovery if event.step.action is None else run.recovery.stepped()
     past, step, serial = run.past, event.step, run.step_serial
     if past is not None:
-        past, moment = past.added(event)
+        # While a person drives, episodes go on after the time limit.
+        driven = run.settings.action_source == "sliders" and run.settings.episode_end == "continue"
+        past, moment = past.added(event, limited=not driven)
         step, serial = moment.step, moment.serial
     first = run.first_step_due
     run = replace(run, recovery=recovery, past=past, step=step, step_serial=serial, first_step_due=False)

@@ -30,7 +30,7 @@ class PreviousEnv(Command, frozen=True):
 
 
 class NextFailedEnv(Command, frozen=True):
-    """Next env whose last episode failed, at its end."""
+    """Next env whose last episode failed, at its end; if none failed, one at its time limit."""
 
     key = "e"
     context = "live"
@@ -69,7 +69,7 @@ class SortEnvs(Command, frozen=True):
 class FilterEnvs(Command, frozen=True):
     """List only these envs."""
 
-    which: Literal["all", "failed", "running", "flagged"]
+    which: Literal["all", "unsolved", "failed", "limit", "running", "flagged"]
 
 
 class ToggleEnvEntry(Command, frozen=True):

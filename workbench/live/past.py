@@ -117,9 +117,13 @@ class Past:
 
     # --- events --------------------------------------------------------------------------------------
 
-    def added(self, stepped: Stepped) -> tuple[Past, Moment]:
-        """Add a moment. Returns the new past, and the moment."""
-        moment = self.history.add(stepped)
+    def added(self, stepped: Stepped, limited: bool = True) -> tuple[Past, Moment]:
+        """Add a moment. Returns the new past, and the moment.
+
+        Args:
+            limited: whether the time limit ends the episodes.
+        """
+        moment = self.history.add(stepped, limited)
         past = self
         if stepped.restored is not None and stepped.restored.number:
             past = replace(past, entered=stepped.restored.number)

@@ -20,7 +20,14 @@ def cells_of(rows: EnvRows, envs: NDArray[np.int64]) -> list[SimpleNamespace]:
 
 @pytest.mark.parametrize(
     ("wanted", "envs"),
-    [("all", [0, 1, 2, 3, 4, 5]), ("failed", [2, 3, 4]), ("running", [0, 4, 5]), ("flagged", [5])],
+    [
+        ("all", [0, 1, 2, 3, 4, 5]),
+        ("unsolved", [2, 3, 4]),
+        ("failed", [2, 4]),
+        ("limit", [3]),
+        ("running", [0, 4, 5]),
+        ("flagged", [5]),
+    ],
 )
 def test_filters(wanted: str, envs: list[int]) -> None:
     assert np.flatnonzero(mask(rows_of(), wanted)).tolist() == envs  # type: ignore[arg-type]
@@ -68,8 +75,8 @@ def test_cells_show_the_state_of_an_env() -> None:
     assert (running.last, running.last_steps) == ("success", "41")
     assert running.tally == "5 episodes ended: 3 success, 1 failed, 1 time limit"
     assert (solved.state, solved.first_true, solved.last) == ("success", ("33", "20"), "")
-    assert (cut.state, cut.total) == ("truncated", "")
-    assert (after.last, after.last_steps) == ("fail", "9") and after.first_true == ("", "")
+    assert (cut.state_word, cut.total) == ("time limit", "")
+    assert (after.last, after.last_steps) == ("failed", "9") and after.first_true == ("", "")
     assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
 
 

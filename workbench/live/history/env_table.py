@@ -29,8 +29,8 @@ class Outcome(IntEnum):
     TRUNCATED = 3
 
 
-EnvEvent = Literal["failed", "flagged"]
-"""The end of an episode without success, or the first outlier of an episode."""
+EnvEvent = Literal["failed", "limit", "flagged"]
+"""The end of an episode by fail or at the time limit, or the first outlier of an episode."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,8 @@ def event_step(rows: EnvRows, env: int, event: EnvEvent) -> int | None:
     """The step of an env's present episode at which this event happened; None if it has not happened."""
     if event == "flagged":
         return rows.outliers[env][0].step if env in rows.outliers else None
-    return int(rows.end[env]) if rows.outcome[env] in (Outcome.FAIL, Outcome.TRUNCATED) else None
+    wanted = Outcome.FAIL if event == "failed" else Outcome.TRUNCATED
+    return int(rows.end[env]) if rows.outcome[env] == wanted else None
 
 
 class EnvTable:
@@ -162,7 +163,11 @@ class EnvTable:
         self._begin(np.ones(count, bool), first)
 
     def add(
-        self, stepped: Stepped, then: EnvRows | None, rewards_then: Callable[[int], NDArray[np.float32]]
+        self,
+        stepped: Stepped,
+        then: EnvRows | None,
+        rewards_then: Callable[[int], NDArray[np.float32]],
+        limited: bool = True,
     ) -> EnvRows:
         """Add one event: a reset of some envs, a jump back, or a control step of all envs.
 
@@ -170,6 +175,7 @@ class EnvTable:
             then: the rows at the moment that some envs went back to. None without a jump back, or if that moment is
                 unknown. If it is unknown, the rows of these envs begin without a past.
             rewards_then: returns the rewards of an env's episode up to that moment, oldest first.
+            limited: whether the time limit ends the episodes.
 
         Returns:
             The rows to store in the moment.
@@ -190,7 +196,7 @@ class EnvTable:
         self._tick += 1
         if stepped.pulled is not None:
             self._note_hand((stepped.pulled.env,))
-        self._step(step)
+        self._step(step, limited)
         return self._now
 
     def _note_hand(self, env_idx: Sequence[int]) -> None:
@@ -213,7 +219,7 @@ class EnvTable:
         oldest_first = np.arange(self._tick, self._tick + KEPT_REWARDS) % KEPT_REWARDS
         return replace(self._now, rewards=self._rewards[:, oldest_first])
 
-    def _step(self, step: StepResult) -> None:
+    def _step(self, step: StepResult, limited: bool) -> None:
         now, first, outliers = self._now, dict(self._now.first), self._now.outliers
         for name, so in _flags(step):
             _note_first(first, name, so, step)
@@ -237,7 +243,7 @@ class EnvTable:
             first=now.first if same else first,
             outliers=outliers,
         )
-        ends = (step.terminated | step.truncated) & running
+        ends = (step.terminated | (step.truncated & limited)) & running
         if ends.any():
             success = dict(_flags(step)).get("success", np.zeros(len(ends), bool))
             # A task's own rule may terminate an env without success or fail: that counts as fail.

@@ -213,12 +213,15 @@ class History:
 
     # --- events ------------------------------------------------------------------------------------
 
-    def add(self, stepped: Stepped) -> Moment:
+    def add(self, stepped: Stepped, limited: bool = True) -> Moment:
         """Add a moment.
 
         Without an action (a reset or a jump back) the worker sends reward zero and no reward terms. Other
         values are stored instead: NaN for envs that were reset, those of the origin for envs that went back,
         and those of the previous moment for all other envs.
+
+        Args:
+            limited: whether the time limit ends the episodes.
         """
         restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
         origin = None if restored is None else self.at(restored.origin)
@@ -228,6 +231,7 @@ class History:
             stepped,
             None if origin is None else origin.rows,
             lambda env: self._rewards_until(env, origin, KEPT_REWARDS),
+            limited,
         )
         self.count += not jumps
         snapshot = None
@@ -241,7 +245,7 @@ class History:
             jumped=stepped.reset_mask,
             seeds=stepped.seeds,
             tick=self.count,
-            event_flags=self._events(stepped, rows),
+            event_flags=self._events(stepped, rows, limited),
             restored=restored,
             number=stepped.number,
             snapshot=snapshot,
@@ -591,14 +595,14 @@ class History:
                 take(origin.step, list(restored.env_idx), list(restored.source))
         return replace(step, reward=reward, evaluate={**step.evaluate, **terms})
 
-    def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
+    def _events(self, stepped: Stepped, rows: EnvRows, limited: bool) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask
         if jumped.any():
             # Success or fail in a restored state is not an event of this moment: it happened at the origin.
             restored = stepped.restored
             flag = RESET if restored is None else BY_HAND if restored.moved else WENT_BACK
             return np.where(jumped, flag, 0).astype(np.uint8)
-        event_flags = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
+        event_flags = np.where(step.truncated & limited, TRUNCATED, 0).astype(np.uint8)
         lost = OutlierKind.REWARD_NOT_FINITE
         for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, lost)):
             if what in rows.first:

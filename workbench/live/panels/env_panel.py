@@ -35,16 +35,19 @@ from workbench.page.widgets.paged import Paged
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.visitors import Visitor
 
-Filter = Literal["all", "failed", "running", "flagged"]
+Filter = Literal["all", "unsolved", "failed", "limit", "running", "flagged"]
 FILTERS: dict[Filter, tuple[str, str]] = {
     "all": ("all envs", "There is no env."),
-    "failed": ("last episode without success", "Every env's last episode ended in success."),
+    "unsolved": ("last episode without success", "Every env's last episode ended in success."),
+    "failed": ("last episode failed", "No env's last episode failed."),
+    "limit": ("last episode at the time limit", "No env's last episode reached the time limit."),
     "running": ("running", "No env is running."),
     "flagged": ("flagged", "No env is flagged."),
 }
 """Label of the choice, and text of an empty table."""
 FILTER_HINT = (
-    "last episode without success: the last finished episode ended by fail or at the time limit. "
+    "last episode: the last finished one. "
+    "without success: it ended by fail or at the time limit. "
     "flagged: something odd in the current or the previous episode."
 )
 WORDS = {
@@ -53,6 +56,12 @@ WORDS = {
     Outcome.FAIL: "failed",
     Outcome.TRUNCATED: "time limit",
 }
+_ENDS: dict[Filter, tuple[Outcome, ...]] = {
+    "unsolved": (Outcome.FAIL, Outcome.TRUNCATED),
+    "failed": (Outcome.FAIL,),
+    "limit": (Outcome.TRUNCATED,),
+}
+"""Outcomes of the last episode that pass a filter."""
 TABLE = "envs"
 """The panel's name in `TellUnfolded`."""
 MAX_DEFAULT_ENTRIES = 6
@@ -119,14 +128,14 @@ def gives_way(entries: tuple[str, ...], chosen: Mapping[str, bool], sorted_by: s
 def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
     """(N,) whether each env passes a filter.
 
-    ``failed``: the present episode ended without success or, while it runs, the previous one did.
+    ``unsolved``: the present episode ended without success or, while it runs, the previous one did. ``failed``
+    and ``limit``: it ended by fail, or at the time limit.
     ``flagged``: there are outliers in the present or the previous episode.
     """
     everyone = np.ones(rows.num_envs, bool)
-    if wanted == "failed":
+    if (ends := _ENDS.get(wanted)) is not None:
         running = rows.outcome == Outcome.RUNNING
-        bad = (Outcome.FAIL, Outcome.TRUNCATED)
-        return np.where(running, np.isin(rows.last.outcome, bad), np.isin(rows.outcome, bad))
+        return np.isin(np.where(running, rows.last.outcome, rows.outcome), ends)
     if wanted == "running":
         return rows.outcome == Outcome.RUNNING
     if wanted == "flagged":
@@ -179,11 +188,14 @@ def make_rows(
             {
                 "env": env,
                 "state": state,
+                "state_word": WORDS[Outcome(int(rows.outcome[env]))],
                 "total": number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
                 "steps": str(int(rows.steps[env])),
                 "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
                 "curve": curve,
-                "last": ("cut short" if last == "running" else last) if had_one else "",
+                "last": ("cut short" if last == "running" else WORDS[Outcome(int(rows.last.outcome[env]))])
+                if had_one
+                else "",
                 "last_steps": str(int(rows.last.steps[env])),
                 "last_state": last,
                 "tally": f"{counted(int(rows.ended[env]), 'episode')} ended: {ended_text(rows, [env])}",
@@ -316,7 +328,7 @@ class EnvPanel(MomentPart):
             case ShowFirstFlagged():
                 self._select_first_flagged()
             case NextFailedEnv():
-                self._select_next("failed")
+                self._select_next("failed", "limit")
             case NextFlaggedEnv():
                 self._select_next("flagged")
             case SortEnvs(column=column):
@@ -434,7 +446,7 @@ class EnvPanel(MomentPart):
         def longest(texts: Iterable[str]) -> int:
             return max(STEP_CHARACTERS, *map(len, texts), 0)
 
-        states = longest(row["state"] for row in shown)
+        states = longest(row["state_word"] for row in shown)
         last = longest(row["last"] for row in shown)
         firsts = [
             EnvColumn(
@@ -489,12 +501,22 @@ class EnvPanel(MomentPart):
         if env is not None:
             self._session.happen(EnvEventShown(env, "flagged"))
 
-    def _select_next(self, wanted: EnvEvent) -> None:
+    def _select_next(self, wanted: EnvEvent, or_else: EnvEvent | None = None) -> None:
         """Select the next env (by number, wrapping around) with the wanted event in its present or previous
-        episode, and go to this event. Uses the newest moment, so that pressing again visits all such envs."""
+        episode, and go to this event. Uses the newest moment, so that pressing again visits all such envs.
+
+        Args:
+            or_else: event to look for if no env has the wanted one.
+        """
         rows = self._session.look(lambda run: run.newest_env_table())
         envs = np.zeros(0, int) if rows is None else np.flatnonzero(mask(rows, wanted))
+        if not len(envs) and or_else is not None:
+            return self._select_next(or_else)
         if not len(envs):
-            raise Refused(f"No env has {'failed' if wanted == 'failed' else 'an outlier'}.")
+            raise Refused(
+                "No env has an outlier."
+                if wanted == "flagged"
+                else "No env's last episode failed or reached the time limit."
+            )
         later = envs[envs > self._session.view().selected_env]
         self._session.happen(EnvEventShown(int(later[0] if len(later) else envs[0]), wanted))
