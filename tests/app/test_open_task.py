@@ -11,7 +11,7 @@ import pytest
 from tests.drive.panels import Panels
 from tests.drive.scenes import camera as camera_info
 from tests.drive.scripted import scripted
-from tests.drive.session import camera, moved, wait_until
+from tests.drive.session import camera, hold_saving, moved, wait_until
 from tests.drive.waiting import until
 from workbench.app import shared
 from workbench.app.open_task import Choices
@@ -21,9 +21,11 @@ from workbench.cameras.commands import UndoCamera
 from workbench.cameras.events import CameraChosen, CameraPlaced
 from workbench.cameras.view import StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
-from workbench.live.commands import PauseRun, PlayRun
+from workbench.live.commands import PauseRun, PlayRun, Step
+from workbench.live.process.background_jobs import JobProgress
 from workbench.machine.loop import do, result_of
 from workbench.page.door.gated_server import GatedServer
+from workbench.record.saving_state import EpisodesSaved, SaveProgressed, SaveWanted
 from workbench.start.catalogue import Entry, Section
 from workbench.start.recents import RecentTasks
 from workbench.start.registered import RegisteredTasks
@@ -39,8 +41,12 @@ LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "min
 class Desk:
     """A workbench started in ``work``, with a task file there and a recently opened one elsewhere."""
 
-    def __init__(self, app: App, opened: list[tuple[TaskName, TaskOptions]], folder: Path) -> None:
+    def __init__(
+        self, app: App, opened: list[tuple[TaskName, TaskOptions]], folder: Path, notices: list[str]
+    ) -> None:
         self.app, self.opened, self.folder = app, opened, folder
+        self.notices = notices
+        """Messages of the sessions for the terminal."""
         self.panels = Panels(app.shared.server)
         self.panels.come_to(app.shared.visitors)
         self.catalogue = app.open_task.catalogue
@@ -87,11 +93,19 @@ def desk(tmp_path: Path, gated_server: GatedServer, monkeypatch: pytest.MonkeyPa
     recents.add(str(tmp_path / "elsewhere/other.py"), TaskOptions(3, env_kwargs={"size": 2}))
     recents.add(str(tmp_path / "elsewhere/gone.py"), TaskOptions())
     opened: list[tuple[TaskName, TaskOptions]] = []
+    notices: list[str] = []
 
     def make(task: TaskName, options: TaskOptions, kept: KeptWork | None = None) -> Session:
         opened.append((task, options if kept is None else kept.options))
         worker = scripted(2, info=replace(camera_info(), settings=LENS))
-        return Session(task, options, recordings=tmp_path / "kept", make_worker=worker, kept=kept)
+        return Session(
+            task,
+            options,
+            recordings=tmp_path / "kept",
+            make_worker=worker,
+            kept=kept,
+            on_notice=notices.append,
+        )
 
     app = App(
         gated_server,
@@ -101,7 +115,7 @@ def desk(tmp_path: Path, gated_server: GatedServer, monkeypatch: pytest.MonkeyPa
         choices=Choices(recents, make, TaskOptions(5)),
     )
     app.shared.pages.start("start")
-    yield Desk(app, opened, tmp_path)
+    yield Desk(app, opened, tmp_path, notices)
     app.close()
 
 
@@ -140,6 +154,36 @@ def test_a_reopened_task_has_its_selections_and_camera_edits(desk: Desk) -> None
     assert (view.selected_env, view.settings.speed, view.of(StudioView).selected) == (1, 2.0, CAMERA)
     again.do(UndoCamera())
     assert not moved(again.view()), "the undo history is kept too"
+
+
+def test_a_task_whose_episode_is_being_saved_is_closed_when_the_episode_is_saved(desk: Desk) -> None:
+    desk.choose("push.py")
+    first = desk.session_of("push.py")
+    hold_saving(first)
+    first.do(Step())
+    wait_until(first, lambda view: view.timeline.moments == 2, "a step")
+    first.happen(SaveWanted((0,)))
+    first.happen(SaveProgressed(1, JobProgress("rendering again", 120, 290)))
+    desk.choose("pull.py")
+    desk.session_of("pull.py")
+    until(lambda: "120 of 290" in desk.app.open_task.doing(), "the progress on the page")
+    first.happen(EpisodesSaved(1, "saved"))
+    desk.idle()
+    assert first.saving().unsaved == 0 and desk.app.shared.sessions == {desk.app.shared.home}
+
+
+def test_the_end_of_the_program_does_not_wait_for_an_episode_that_is_being_saved(desk: Desk) -> None:
+    desk.choose("push.py")
+    first = desk.session_of("push.py")
+    hold_saving(first)
+    first.do(Step())
+    wait_until(first, lambda view: view.timeline.moments == 2, "a step")
+    first.happen(SaveWanted((0,)))
+    desk.choose("pull.py")
+    until(lambda: "saving 1 episode" in desk.app.open_task.doing(), "the saving")
+    desk.app.finish_saving(0.0)
+    desk.app.close()
+    assert any("1 episode" in notice for notice in desk.notices)
 
 
 @pytest.mark.thorough

@@ -104,6 +104,11 @@ class FakeWorker:
         """Does nothing: it has no thread."""
 
 
+def hold_saving(session: Session) -> None:
+    """Save no episode of the session: the test sends the events of the saving jobs."""
+    session._past_saver.begin = lambda effect, placed: None
+
+
 class FakeWorkerSession:
     """A session whose worker is the test: `asked` returns the worker's requests, `tell` sends its events."""
 

@@ -28,10 +28,10 @@ from workbench.episodes.reader.read_episode import read_episode
 from workbench.hands.commands import BeginAgain, DiscardEpisode, KeepEpisode, ToggleDriving
 from workbench.hands.drive_keys import GRIPPER_KEY, PAIRS
 from workbench.hands.state import BodyMoved, Driven, Hands
-from workbench.live.commands import PauseRun
+from workbench.live.commands import PauseRun, ResetSelected
 from workbench.live.timeline_commands import UndoReset
 from workbench.page.command import Refused
-from workbench.record.commands import StopRecording
+from workbench.record.commands import StopRecording, ToggleSavePast
 from workbench.record.saving_state import KeptEpisodes
 from workbench.record.state import RecordingStatus, RecordingWanted
 
@@ -157,10 +157,13 @@ def test_a_kept_episode_goes_on_after_the_time_limit_and_the_next_seed_begins(dr
     drive(driven, 51)
     assert driven.view().step.truncated[ENV]
     jump(driven, lambda: driven.do(KeepEpisode()))
-    assert seed(driven) == first + 1 and f"seed {first} (51 steps) is kept" in driven.view().of(Hands).note
+    note = driven.view().of(Hands).note
+    assert seed(driven) == first + 1 and f"seed {first} (51 steps)" in note
+    assert kept(driven).saved > before.saved or "is kept" not in note, "it is not saved yet"
     with pytest.raises(Refused, match="kept already"):
         driven.do(KeepEpisode())
     view = wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
+    assert f"seed {first} (51 steps) is kept" in view.of(Hands).note
     assert view.of(RecordingStatus).kept.successes == before.successes
     episode = read_episode(Path(view.of(RecordingStatus).last_file or ""))
     assert (episode.info.seed, episode.info.env_index, episode.length) == (first, ENV, 51)
@@ -177,11 +180,51 @@ def test_nothing_is_saved_of_a_discarded_episode_and_undo_brings_it_back(driven:
     assert "discarded" in driven.view().of(Hands).note
     jump(driven, lambda: driven.do(UndoReset()))
     np.testing.assert_array_equal(driven.view().step.poses[ENV], stood)
+    assert not driven.view().of(Hands).note, "it is back"
     jump(driven, lambda: driven.do(BeginAgain()))
     assert seed(driven) == first + 1 and "was not kept" in driven.view().of(Hands).note
     jump(driven, lambda: driven.do(BeginAgain()))
     assert seed(driven) == first + 2 and not driven.view().of(Hands).note
     assert driven.view().of(RecordingStatus) == before
+
+
+def test_a_note_on_an_episode_that_was_left_ends_with_the_next_reset_or_with_driving(driven: Session) -> None:
+    drive(driven, 1)
+    jump(driven, lambda: driven.do(DiscardEpisode()))
+    jump(driven, lambda: driven.do(ResetSelected()))
+    assert not driven.view().of(Hands).note
+    drive(driven, 1)
+    jump(driven, lambda: driven.do(DiscardEpisode()))
+    assert driven.view().of(Hands).note
+    driven.do(ToggleDriving())
+    assert not driven.view().of(Hands).note
+    driven.do(ToggleDriving())
+
+
+def test_a_kept_episode_that_was_not_saved_can_be_kept_again(driven: Session) -> None:
+    before = kept(driven)
+    drive(driven, 2)
+    driven.do(KeepEpisode())
+    driven.do(ToggleSavePast())
+    view = driven.view()
+    assert view.of(RecordingStatus).kept.failed == before.failed + 1 and "not saved" in view.of(Hands).note
+    driven.do(KeepEpisode())
+    wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
+
+
+def test_a_session_that_is_closed_first_saves_the_kept_episode(child_process: None, tmp_path: Path) -> None:
+    with live_session("PushCube-v1", tmp_path, num_envs=1, control_mode="pd_ee_delta_pose") as session:
+        session.do(ToggleDriving())
+        session.do(PauseRun())
+        after_worker_reply(session)
+        for _ in range(30):
+            step(session)
+        steps = session.view().step.elapsed_steps[0]
+        session.do(KeepEpisode())
+        session.close(finish_saving=True)
+        assert session.saving().kept == KeptEpisodes(saved=1)
+    (recording,) = tmp_path.glob("*.rrd")
+    assert read_episode(recording).length == steps
 
 
 def test_the_episode_that_was_just_left_can_be_kept(driven: Session) -> None:

@@ -248,8 +248,7 @@ def test_late_events_of_an_older_recording_or_job_change_only_the_waiting_bytes(
     assert state.recording.number == 2
     changed, effects = apply_filtered(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
     assert effects == [] and changed.recording == replace(state.recording, waiting_bytes=-10)
-    state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
-    assert [type(effect) for effect in effects] == [BeginSaving]
+    state, _ = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveFailed(1, "it failed"), SaveWanted((1,)))
     late = RescoringUpdate(1, RescoreView("done"))
     for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), late):
         assert apply_filtered(state, event) == (state, [])
@@ -266,6 +265,15 @@ def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):
         apply_filtered(state, Asked(SaveSolved()))
+
+
+def test_a_save_that_is_asked_for_while_another_runs_waits_for_it() -> None:
+    state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
+    assert effects == [] and state.recording.saving.unsaved == 2
+    state, (begin,) = apply_filtered(state, EpisodesSaved(1, "saved"))
+    assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [1]
+    state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))
+    assert state.recording.saving.unsaved == 0
 
 
 def test_kept_episodes_are_saved_one_after_another_and_a_stop_counts_those_that_are_lost() -> None:

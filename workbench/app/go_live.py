@@ -202,7 +202,7 @@ class GoLive:
         opened = await self._opening.run(open_cleared)
         if opened is None or transition.given_up:
             if opened is not None:
-                self._ending.begin(lambda: _end(*opened))
+                self._ending.begin(lambda: self._end(*opened))
             return None
         self._let_go()
         self._own = opened
@@ -269,7 +269,12 @@ class GoLive:
         """End the session that was opened here; the caller shows another page."""
         own, self._own = self._own, None
         if own is not None:
-            self._ending.begin(lambda: _end(*own))
+            self._ending.begin(lambda: self._end(*own))
+
+    def _end(self, session: Session, folder: Path | None) -> None:
+        self._shared.close_session(session)
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
     def _notify(self, text: str) -> None:
         notify_all(self._shared.server, "This recording cannot be continued", text, "red")
@@ -335,9 +340,3 @@ class GoLivePart(PagePart[ReviewView]):
                 if not self._go_live.can_go_home():
                     raise Refused("No other task is open.")
                 self._go_live.go_home()
-
-
-def _end(session: Session, folder: Path | None) -> None:
-    session.close()
-    if folder is not None:
-        shutil.rmtree(folder, ignore_errors=True)

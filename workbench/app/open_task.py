@@ -46,7 +46,7 @@ class OpenTask:
     """Opens the task that the user chooses from the list.
 
     It opens one task at a time, which may take minutes: it waits until the user allows the code, and until
-    the old session has written its recordings. A newer request withdraws the question that an older request
+    the old session has saved and written its recordings. A newer request withdraws the question that an older request
     still asks. The page of the new session is shown first, then the old session is closed as at the end of
     the program. Call all methods on the loop, except `close`.
 
@@ -101,7 +101,7 @@ class OpenTask:
 
     def doing(self) -> str:
         """Text for the page: the work in progress; empty if there is none."""
-        return self._doing
+        return " ".join(filter(None, (self._doing, self._shared.saving_text())))
 
     def is_open(self, entry: Entry) -> bool:
         """Whether this is the open task."""
@@ -187,7 +187,7 @@ class OpenTask:
         await asyncio.wait([shown], timeout=_SHOW_TIMEOUT_SECONDS)
         if old is not None:
             self._doing = "Closing the previous task: writing its recordings …"
-            await self._aside.run(old.close)
+            await self._aside.run(lambda: shared.close_session(old))
 
     def _notify(self, title: str, text: str) -> None:
         notify_all(self._shared.server, title, text, "red")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from workbench.app.review_page import ReviewPage, ReviewTools
 from workbench.app.session import Session
 from workbench.app.shared import Shared
 from workbench.app.start_page import StartPage
+from workbench.machine.loop import begin, result_of
 from workbench.page.command import Command, Refused
 from workbench.page.commands import AnswerTrust, CloseDialog, OpenHelp, RenewToken
 from workbench.page.door.gated_server import GatedServer
@@ -129,8 +131,20 @@ class App:
             chooser=self.open_task,
         )
 
+    def finish_saving(self, seconds: float) -> None:
+        """Wait up to `seconds` until no session is saving episodes. Must not be called on the loop."""
+
+        async def saved() -> None:
+            await asyncio.wait([begin(one.saved()) for one in self.shared.sessions], timeout=seconds)
+
+        if self.shared.sessions:
+            result_of(saved())
+
     def close(self) -> None:
-        """Stop the pages and their readers, and close the open session. The caller closes the server."""
+        """Stop the pages and their readers, and close the open session; episodes that are still being saved are lost.
+        The caller closes the server."""
+        for session in self.shared.sessions:
+            session.give_up_saving()
         self.shared.pages.stop()
         self._problems.close()
         self.open_task.close()

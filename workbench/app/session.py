@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import time
@@ -54,12 +55,12 @@ from workbench.live.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.live.run import Run, first_run
 from workbench.live.view import SessionView, view_of
 from workbench.machine.kept_choices import keep_check_after_save
-from workbench.machine.loop import BlockingPool, ChangeCounter, do, later, on_loop, wait_for_disk
+from workbench.machine.loop import BlockingPool, ChangeCounter, do, later, on_loop, result_of, wait_for_disk
 from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening
 from workbench.page.command import Command
 from workbench.record.live_recorder import LiveRecorder
 from workbench.record.save_past import PastSaver
-from workbench.record.saving_state import BeginSaving, EndSaving
+from workbench.record.saving_state import BeginSaving, EndSaving, Saving
 from workbench.record.state import BeginEpisodes, EndEpisodes, LiveRecording, TakeStep
 from workbench.rescore.past_jobs import PastRescorer
 from workbench.rescore.past_scores import RescoredCurve
@@ -75,6 +76,8 @@ from workbench.task.watch import SourceWatcher
 Value = TypeVar("Value")
 HISTORY_BYTES = 256 * 1024**2
 """Default memory limit of the history."""
+_POLL_SECONDS = 0.05
+"""Interval at which `saved` looks whether an episode is still being saved."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,8 @@ class Session:
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
+        self._gives_up = False
+        """Whether nothing waits any more for episodes that are being saved."""
         self._state = State(
             first_run(task, options, history_bytes, settings),
             LiveRecording(str(recordings)),
@@ -385,10 +390,28 @@ class Session:
         self.happen(RunToEnter(run, number, everywhere, source_file, source))
         return number
 
-    def close(self) -> None:
-        """End all processes and threads; waits for episodes that are being written. Must not be called on the loop."""
-        if lost := do(lambda: self._state.recording.saving.kept.waiting):
-            self._on_notice(f"The session ended before all kept episodes were saved: {lost} not saved.")
+    @on_loop
+    def saving(self) -> Saving:
+        """The episodes that are being saved from the history. Also valid while the session closes."""
+        return self._state.recording.saving
+
+    @on_loop
+    def give_up_saving(self) -> None:
+        """End the waits of `saved` and `close` for episodes that are being saved."""
+        self._gives_up = True
+
+    async def saved(self) -> None:
+        """Wait until no episode is being saved, or until `give_up_saving`."""
+        while self._state.recording.saving.unsaved and not self._gives_up:
+            await asyncio.sleep(_POLL_SECONDS)
+
+    def close(self, finish_saving: bool = False) -> None:
+        """End all processes and threads; waits for episodes that are being written. Must not be called on the loop.
+
+        Args:
+            finish_saving: also wait, until `give_up_saving`, for episodes that are being saved from the history. Only
+                the process that saves them is kept meanwhile.
+        """
         stop_listening(self._log)
         self._changes.close()
         self._worker.stop()
@@ -406,6 +429,10 @@ class Session:
         self._seeds.close()
         self._policies.close()
         self._studio.close()
+        if finish_saving:
+            result_of(self.saved())
+        if text := self.saving().text:
+            self._on_notice(f"The session ended, and this is lost: {text}.")
         self._past_saver.close()
         self._background.close()
         self._recorder.close()

@@ -17,12 +17,15 @@ from workbench.library.folder import Library
 from workbench.machine.loop import BlockingPool
 from workbench.page.door.gated_server import GatedServer
 from workbench.page.scene.viewpoint import View3D
+from workbench.page.widgets.notices import notify_all
+from workbench.page.widgets.templates import counted
 from workbench.page.widgets.visitors import PATH, Visitors
 from workbench.review.playback import Review
 from workbench.review.recorded_scene import SceneProcess
 
 MIN_FREE_BYTES = 4 << 30
 """Minimum free RAM for rendering catalogue thumbnails while a task is open."""
+_NOTICE_SECONDS = 8.0
 _RECOVERY_TIMEOUT_SECONDS = 10.0
 """Maximum time that `close` waits for the recovery of episodes."""
 
@@ -73,6 +76,8 @@ class Shared:
         self.home = session
         """The session that the user opened, by command or from the list. `session` differs while a recording of another task
         is continued."""
+        self._saving: set[Session] = set()
+        """Sessions that are closed when their episodes are saved."""
         self.stage = View3D(self.server)
         self.pages = Pages(self.server, self.stage, make_page)
 
@@ -130,6 +135,41 @@ class Shared:
         view = session.view()
         free = psutil.virtual_memory().available
         return view.state in ("paused", "error", "stopped") and view.busy is None and free > MIN_FREE_BYTES
+
+    @property
+    def sessions(self) -> set[Session]:
+        """The open sessions, and those that are closed when their episodes are saved."""
+        return {one for one in (*self._saving, self.home, self.session) if one is not None}
+
+    def saving_text(self) -> str:
+        """Text for the page: the episodes that are being saved of sessions that no page shows any more; or empty."""
+        return ", ".join(f"saving {text}" for one in list(self._saving) if (text := one.saving().text))
+
+    def close_session(self, session: Session) -> None:
+        """Close a session that no page shows any more. Must not be called on the loop.
+
+        If its episodes are still being saved, waits for them, and tells the pages what becomes of them.
+        """
+        before = session.saving()
+        if not before.unsaved:
+            session.close()
+            return
+        what = counted(before.unsaved, "episode")
+        notify_all(
+            self.server,
+            "Still saving",
+            f"{what} of the previous task: Open another task (Ctrl+O) shows the progress.",
+            seconds=_NOTICE_SECONDS,
+        )
+        self._saving.add(session)
+        session.close(finish_saving=True)
+        self._saving.discard(session)
+        after = session.saving()
+        if after.status.failed or after.kept.failed > before.kept.failed:
+            why = after.kept.why or after.status.message
+            notify_all(self.server, "An episode of the previous task was not saved", why, "red")
+        elif not after.unsaved:
+            notify_all(self.server, "Saved", f"{what} of the previous task.", None, _NOTICE_SECONDS)
 
     def close(self) -> None:
         """End the recovery of episodes, and close the recordings. Sessions are not closed."""

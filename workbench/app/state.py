@@ -128,7 +128,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     solving, for_solver = of_solver.apply(state.solving, event, run)
     policies, for_policies = of_policies.apply(state.policies, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
-    hands, for_hands = of_hands.apply(state.hands, event, run, recording.env_idx)
+    hands, for_hands = of_hands.apply(state.hands, event, run, recording.env_idx, recording.saving.requests)
     resets, for_resets = of_resets.apply(state.resets, event, run)
     search, for_search = of_search.apply(state.search, event, run)
     start, for_start = of_start.apply(state.start_edit, event, run)

@@ -36,6 +36,8 @@ from workbench.task.reference import TaskName, named_file
 
 _CLOSING_SECONDS = 1.4
 """Closing is given up if no episode has been written for this time, because a disk may hang."""
+_SAVING_SECONDS = 2.0
+"""Maximum time for which closing waits for episodes that are being saved from the history."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
 """Queue of functions that the command calls in turn. An int in the queue ends the command with this exit
 code."""
@@ -271,6 +273,7 @@ def _serve(
 
 def _close(app: App, gated_server: GatedServer) -> None:
     """Close everything. Gives up after `_CLOSING_SECONDS` in which no episode was written."""
+    app.finish_saving(_SAVING_SECONDS)
     closing = BlockingPool("closing").begin(app.close)
     written = _episodes_written(app)
     while not futures.wait([closing], _CLOSING_SECONDS).done:
@@ -281,9 +284,7 @@ def _close(app: App, gated_server: GatedServer) -> None:
 
 
 def _episodes_written(app: App) -> int:
-    return sum(
-        session.episodes_written for session in {app.shared.home, app.shared.session} if session is not None
-    )
+    return sum(session.episodes_written for session in app.shared.sessions)
 
 
 def _renew_token(gated_server: GatedServer) -> None:

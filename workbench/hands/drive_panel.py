@@ -49,8 +49,9 @@ class DrivePanel(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         hands = view.of(Hands)
-        kept = view.of(RecordingStatus).kept
-        return hands.driving, hands.reach.shown, hands.note, kept, view.task_serial, view.selected_env
+        recording = view.of(RecordingStatus)
+        saving = recording.kept, recording.saving.progress
+        return hands.driving, hands.reach.shown, hands.note, saving, view.task_serial, view.selected_env
 
     def draw(self, view: SessionView) -> None:
         hands = view.of(Hands)
@@ -73,8 +74,9 @@ class DrivePanel(PagePart[SessionView]):
         )
         rows = _rows(bindings(actions), bool(gripper(actions))) if driving else []
         of_set = [tool(name, command) for name, command, _ in SET] if driving else []
+        recording = view.of(RecordingStatus)
         self._html.content = tools_html([button, reach], of_set) + render(
-            "drive_keys", rows=rows, note=hands.note, kept=view.of(RecordingStatus).kept
+            "drive_keys", rows=rows, note=hands.note, kept=recording.kept, progress=recording.saving.progress
         )
 
     def do(self, command: Command, visitor: Visitor) -> None:

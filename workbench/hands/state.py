@@ -40,7 +40,16 @@ from workbench.live.messages import (
 )
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
-from workbench.record.saving_state import EpisodesKept, PastEpisode, find_episode, request_of
+from workbench.record.commands import ToggleSavePast
+from workbench.record.saving_state import (
+    EpisodesKept,
+    EpisodesSaved,
+    PastEpisode,
+    SaveFailed,
+    SaveRequest,
+    find_episode,
+    request_of,
+)
 from workbench.task.description import Stepped
 
 DOES: frozenset[type[Command]] = frozenset(
@@ -111,6 +120,26 @@ class DraggedJoint:
 
 
 @dataclass(frozen=True)
+class KeptRequest:
+    """A kept episode that is being saved."""
+
+    what: SaveRequest
+    saved: str
+    """The note when it is saved."""
+    not_saved: str
+    """The note if it is not saved."""
+
+
+@dataclass(frozen=True)
+class LeftEpisode:
+    """An episode that a person ended and did not keep."""
+
+    env: int
+    was_reset: bool = False
+    """Whether the env's reset, which ended the episode, has come."""
+
+
+@dataclass(frozen=True)
 class Hands:
     """What a person drives and drags by hand, and the last kept episode. Also the view of this feature."""
 
@@ -142,21 +171,33 @@ class Hands:
     so it can be kept again."""
     note: str = ""
     """What became of the last episode of the set."""
+    saves: KeptRequest | None = None
+    """The kept episode that `note` is about, until it is saved."""
+    left: LeftEpisode | None = None
+    """The episode that `note` is about, while `UndoReset` goes back to it."""
 
 
 HandEvent = BodyMoved | BodyPulled | Driven | DrivingDue | ArmDragged | ArmsReleased | Reached
 Change = tuple[Hands, list[Any]]
 
 
-def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ()) -> Change:
+def apply(
+    hands: Hands,
+    event: object,
+    run: Run,
+    recorded: tuple[int, ...] = (),
+    unsaved: tuple[SaveRequest, ...] = (),
+) -> Change:
     """The next state after an event, and the effects to perform.
 
     Args:
         recorded: envs of the running recording.
+        unsaved: what is being saved from the history, after the event.
 
     Raises:
         Refused: the body or the joints cannot be moved, or the robot cannot be driven now; nothing has changed.
     """
+    hands = _with_present_note(hands, event, unsaved)
     match event:
         case Asked(command=ToggleDriving()):
             return _stop(hands) if hands.driving else _start(hands, run)
@@ -174,7 +215,7 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
         case Asked(command=WriteQpos(robot=robot)):
             return hands, [Then(StartWanted(_qpos_now(run, robot)))]
         case Stepped() | TaskFailed() | VersionLoaded() | PagesCounted() | WorkerDied() if hands.dragged:
-            return apply(replace(hands, dragged=None), event, run, recorded)
+            return apply(replace(hands, dragged=None), event, run, recorded, unsaved)
         case Asked(command=BeginAgain() | DiscardEpisode() | KeepEpisode() as command):
             return _end_episode(hands, run, command, recorded)
         case Driven(keys=keys, yaw=yaw, sticks=sticks) if hands.driving:
@@ -182,7 +223,7 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
         case DrivingDue(number=hands.number) if hands.driving and (hands.keys or hands.sticks):
             return _drive(hands, run, (), 0.0)
         case SettingsChanged(values={"action_source": source}) if hands.driving and source != "sliders":
-            return _released(replace(hands, driving=False, keys=(), sticks=()))
+            return _let_go(hands)
         case VersionLoaded():
             hands = replace(hands, reach=of_reach.loaded(hands.reach, run))
             if hands.driving and (run.task is None or not (bindings(run.task.actions) or hands.reach.shown)):
@@ -198,6 +239,30 @@ def apply(hands: Hands, event: object, run: Run, recorded: tuple[int, ...] = ())
         case BodyMoved() | BodyPulled():
             return hands, _handle(event, run)
     return hands, []
+
+
+def _with_present_note(hands: Hands, event: object, unsaved: tuple[SaveRequest, ...]) -> Hands:
+    """`hands` with a note that is still true after the event."""
+    match event:
+        case EpisodesSaved() | SaveFailed() | Asked(command=ToggleSavePast()) if hands.saves is not None:
+            if hands.saves.what not in unsaved:
+                saved = isinstance(event, EpisodesSaved)
+                note = hands.saves.saved if saved else hands.saves.not_saved
+                # Otherwise an episode that was not saved could not be kept again.
+                return _noting(replace(hands, kept=hands.kept if saved else None), note)
+        case Stepped() if hands.left is not None and event.reset_mask[hands.left.env]:
+            if not hands.left.was_reset:
+                return replace(hands, left=replace(hands.left, was_reset=True))
+            return _noting(hands, "")  # the env went back, or was reset again
+        case VersionLoaded() if hands.left is not None:
+            return _noting(hands, "")
+    return hands
+
+
+def _noting(
+    hands: Hands, note: str, saves: KeptRequest | None = None, left: LeftEpisode | None = None
+) -> Hands:
+    return replace(hands, note=note, saves=saves, left=left)
 
 
 def _start(hands: Hands, run: Run) -> Change:
@@ -225,8 +290,8 @@ def _take_over(hands: Hands, run: Run) -> Change:
         keys=(),
         sticks=(),
         closes=False,
-        note="",
     )
+    started = _noting(started, "")
     # An automatic reset would interrupt the person.
     changed = SettingsChanged({"action_source": "sliders", "episode_end": "continue"})
     hold = Send(SetSliderAction(tuple(range(run.num_envs)), (), ()))
@@ -236,8 +301,14 @@ def _take_over(hands: Hands, run: Run) -> Change:
 def _stop(hands: Hands) -> Change:
     """Stop driving, and restore the source of actions from before."""
     back = SettingsChanged({"action_source": hands.source, "episode_end": hands.episode_end})
-    stopped, requests = _released(replace(hands, driving=False, keys=(), sticks=()))
+    stopped, requests = _let_go(hands)
     return stopped, [*requests, Then(back)]
+
+
+def _let_go(hands: Hands) -> Change:
+    """The person drives no longer."""
+    hands = hands if hands.left is None else _noting(hands, "")
+    return _released(replace(hands, driving=False, keys=(), sticks=()))
 
 
 def _released(hands: Hands) -> Change:
@@ -293,10 +364,11 @@ def _end_episode(
     episode = find_episode(history, env, None, limited=False)
     has_step = len(history.episode(env, history.last, 2)) > 1
     if isinstance(command, BeginAgain):
-        note = ""
+        hands = _noting(hands, "")
         if isinstance(episode, PastEpisode) and has_step and env not in recorded:
             note = f"{_named(episode)} was not kept. Shift+U goes back to it."
-        return _begin_episode(replace(hands, note=note), env, next_seed)
+            hands = _noting(hands, note, left=LeftEpisode(env))
+        return _begin_episode(hands, env, next_seed)
     if env in recorded:
         raise Refused(
             "Each episode of this env is recorded now. To keep or discard single episodes, stop the recording (Shift+C)."
@@ -311,7 +383,8 @@ def _end_episode(
         return hands, [*effects, *more]
     if not has_step:
         raise Refused("There is no episode to discard: this one has no step yet.")
-    hands = replace(hands, note=f"{_named(episode)} was discarded. Shift+U brings it back.")
+    note = f"{_named(episode)} was discarded. Shift+U brings it back."
+    hands = _noting(hands, note, left=LeftEpisode(env))
     return _begin_episode(hands, env, next_seed if episode.seed < 0 else episode.seed)
 
 
@@ -324,10 +397,13 @@ def _keep(hands: Hands, run: Run, episode: PastEpisode) -> Change:
     what = request_of(run, (run.env,), kept=True)
     if isinstance(what, str):
         raise Refused(f"{what}.")
-    note = f"{_named(episode)} is kept, {'with' if episode.succeeded else 'without'} success."
+    name, about = _named(episode), ""
     if run.past.history.by_hand(last, env):
-        note += " A body was moved or pulled by hand in it, so its actions alone do not repeat it."
-    return replace(hands, kept=last, note=note), [Then(EpisodesKept(what))]
+        about = " A body was moved or pulled by hand in it, so its actions alone do not repeat it."
+    saved = f"{name} is kept, {'with' if episode.succeeded else 'without'} success.{about}"
+    saves = KeptRequest(what, saved, f"{name} was not saved.")
+    hands = _noting(replace(hands, kept=last), f"{name} is being saved.{about}", saves)
+    return hands, [Then(EpisodesKept(what))]
 
 
 def _begin_episode(hands: Hands, env: int, seed: int) -> Change:

@@ -64,6 +64,24 @@ class Saving:
     """Requests that wait until `running` is done."""
     kept: KeptEpisodes = KeptEpisodes()
 
+    @property
+    def requests(self) -> tuple[SaveRequest, ...]:
+        """The running request, and those that wait."""
+        return self.waiting if self.running is None else (self.running, *self.waiting)
+
+    @property
+    def unsaved(self) -> int:
+        """Number of episodes that are not saved yet."""
+        return sum(len(request.episodes) for request in self.requests)
+
+    @property
+    def text(self) -> str:
+        """Which episodes are not saved yet, such as "1 episode (rendering again, 120 of 290)"; empty for none."""
+        if not self.unsaved:
+            return ""
+        which = f"{self.unsaved} episode{'' if self.unsaved == 1 else 's'}"
+        return which if self.status.progress is None else f"{which} ({self.status.progress.text})"
+
     def status_of(self, run: Run) -> SaveStatus:
         """The status for the shown version, env and moment."""
         if self.status.refused_at in (None, _shown(run)):
@@ -167,7 +185,7 @@ SaveEvent = EpisodesKept | SaveProgressed | EpisodesSaved | SaveFailed
 
 @dataclass(frozen=True)
 class BeginSaving:
-    """Begin this job; cancel the previous one."""
+    """Begin this job. No other job runs."""
 
     job: int
     what: SaveRequest
@@ -238,7 +256,7 @@ def _save(
     if isinstance(what, str):
         status = SaveStatus(what, True, refused_at=_shown(run), progress=saving.status.progress)
         return replace(saving, status=status), []
-    if saving.kept.waiting:
+    if saving.running is not None:
         return replace(saving, waiting=(*saving.waiting, what)), []
     return _begun(saving, what)
 

@@ -21,6 +21,11 @@ class JobProgress:
     done: int
     total: int
 
+    @property
+    def text(self) -> str:
+        """Text for the page, such as "rendering again, 120 of 290"."""
+        return f"{self.what}, {self.done} of {self.total}" if self.total > 1 else self.what
+
 
 class JobFailed(Exception):
     """The job failed. The text is for the page; `problem` is set if the author's code raised."""
