@@ -118,10 +118,24 @@ shapes = st.lists(st.integers(0, 5), max_size=3).map(tuple)
 dtypes = st.sampled_from([torch.bool, torch.int32, torch.float32, torch.float64])
 
 
+@pytest.mark.parametrize(
+    ("body", "line"),
+    [
+        ("return (\n    None\n)", "return ("),
+        ("if info:\n    def score():\n        return 1\n    return score()", "return score()"),
+        ("if info:\n    return 0\nreturn 1", "def compute_dense_reward(self, obs, action, info):"),
+    ],
+)
+def test_the_line_of_a_wrong_value_is_the_only_return(body: str, line: str, write: Write) -> None:
+    text = TASK[: TASK.rindex("pass")] + body.replace("\n", "\n        ") + "\n"
+    problem = check(load_task(str(write("push.py", text, task=True))), {}, 0.5)
+    assert problem is not None and problem.code == line
+
+
 @given(shape=shapes, dtype=dtypes, num_envs=st.integers(1, 5))
 def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dtype, num_envs: int) -> None:
     value = torch.zeros(shape, dtype=dtype)
-    # With one env, a single number counts as its row, as in ManiSkill.
+    # With one env, a single number counts as its row, as in ManiSkill; a rule reports it in another shape.
     a_row_each = shape == (num_envs,) or value.numel() == num_envs == 1
     passes = {
         key: check_step_returns(object, num_envs, {key: value}, None, ()) is None
@@ -131,4 +145,4 @@ def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dt
     reward = check_step_returns(object, num_envs, {}, value, ()) is None
     assert reward == a_row_each
     refused = wrong_reward(value, num_envs, {}) is not None
-    assert refused == (not a_row_each or not dtype.is_floating_point)
+    assert refused == (not a_row_each or not dtype.is_floating_point or len(shape) > 1)

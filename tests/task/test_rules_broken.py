@@ -78,16 +78,16 @@ REWRITTEN = """
         self.target = torch.rand((self.num_envs, 2))  # the fault
 """
 REWARD = """
-    def compute_dense_reward(self, obs, action, info):  # the fault
-        return super().compute_dense_reward(obs, action, info)[:, None]
+    def compute_dense_reward(self, obs, action, info):
+        return super().compute_dense_reward(obs, action, info)[:, None]  # the fault
 """
 STANDS = """
-    def compute_normalized_dense_reward(self, obs, action, info):  # the fault
-        return {reward}
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return {reward}  # the fault
 """
 OBSERVATION = """
-    def _get_obs_extra(self, info):  # the fault
-        return {"goal": self.goal_site.pose.p[0]}
+    def _get_obs_extra(self, info):
+        return {"goal": self.goal_site.pose.p[0]}  # the fault
 """
 HIDES = """
     def evaluate(self):
@@ -190,6 +190,32 @@ def test_an_integer_reward_opens_is_reported_and_is_recorded(
     assert [episode.reward.tolist() for episode in episodes] == [[0.0] * 3, [1.0] * 3]
     with pytest.raises(TaskError, match=rf"returned a {kind} tensor"):
         next(opened(file, rules="stop"))
+
+
+@pytest.mark.parametrize(
+    ("body", "mode", "rule"),
+    [
+        (STANDS.format(reward="torch.zeros(1, 1)"), "normalized_dense", "reward-rows"),
+        (
+            """
+    def evaluate(self):
+        return {**super().evaluate(), "success": torch.zeros(1, 1) > 1}  # the fault
+""",
+            "none",
+            "evaluate-flags",
+        ),
+    ],
+)
+def test_a_column_of_one_env_opens_and_is_reported_at_its_return(
+    body: str, mode: str, rule: str, tmp_path: Path
+) -> None:
+    """Stock ManiSkill passes on such values of a single env; with several envs they are refused."""
+    file, findings = write(body, tmp_path), []
+    options = TaskOptions(num_envs=1, backend="cpu", env_kwargs={**KWARGS, "reward_mode": mode})
+    open_task(file, options, on_finding=findings.append).env.close()
+    finding = next(each for each in findings if each.rule == rule)
+    assert (finding.degree, finding.file) == ("warn", file) and "# the fault" in finding.code
+    assert "shape (1, 1)" in finding.message and "shape (1,)" in finding.message
 
 
 @pytest.mark.parametrize("body", [LOST, BEHIND, REWRITTEN])

@@ -92,7 +92,7 @@ _OF_SEVERAL = frozenset(
         *("other-env-written", "stepped-in-reset", "rows-lost", "rows-rewritten", "applied-by-reset"),
     )
 )
-"""Rules of GPU simulation about several envs: a task with one env cannot break them."""
+"""Rules of GPU simulation about several envs: that a task with one env keeps them says nothing about several."""
 GPU_RESETS = 6
 """Number of resets of random envs, with steps between them."""
 ONE_ENV = "The task runs with one env: --num-envs 1."

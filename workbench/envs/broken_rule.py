@@ -20,7 +20,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from workbench.envs.error_notes import CoreRefusal, Place
 from workbench.envs.gpu_rules import Degree, Finding, Silence, silence_of
 from workbench.machine.library_files import is_installed
-from workbench.machine.parse_python import parse_python
+from workbench.machine.parse_python import line_of_return, parse_python
 
 MAX_PLACES = 64
 """Maximum number of places that are kept; breaches at further places are only counted."""
@@ -279,6 +279,12 @@ def place_of_hook(task: type, hook: str) -> Place | None:
     """Where a hook is defined."""
     code = getattr(inspect.unwrap(getattr(task, hook)), "__code__", None)
     return None if code is None else (code.co_filename, code.co_firstlineno, hook)
+
+
+def place_of_return(task: type, hook: str) -> Place | None:
+    """The only ``return`` of a hook; the line of its ``def`` or first decorator if it has several."""
+    place = place_of_hook(task, hook)
+    return None if place is None else (place[0], line_of_return(*place[:2]), hook)
 
 
 def place_of_class(cls: type) -> Place | None:

@@ -257,20 +257,29 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_flags(evaluate: object) -> str | None:
-    """What is wrong with ``success`` or ``fail`` if one is a tensor of another dtype than bool; else None.
+    """What is wrong with ``success`` or ``fail`` if one is a tensor of another dtype than bool, or, with one env, of shape
+    (1, 1); else None.
 
     ManiSkill's step accepts such a tensor, its wrappers do not.
     """
     for name in FLAGS:
         value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
+        if isinstance(value, torch.Tensor) and value.numel() == 1 < value.ndim:
+            return f"returned {name!r} as {describe(value)}; expected a bool tensor of shape (1,)"
         if isinstance(value, torch.Tensor) and value.dtype != torch.bool:
             return f"returned {name!r} as {describe(value)}; expected a bool tensor: append .bool()"
     return None
 
 
 def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> str | None:
-    """What is wrong with a reward, or None. It must be a floating tensor (N,); NaN is allowed, and shown in the env's row."""
+    """What is wrong with a reward, or None. It must be a floating tensor (N,); NaN is allowed, and shown in the env's row.
+
+    With one env shape () is allowed too, but not (1, 1): ManiSkill's step passes it on,
+    `ManiSkillVectorEnv` with ``record_metrics`` fails on it.
+    """
     problem = no_reward(reward, num_envs)
+    if problem is None and isinstance(reward, torch.Tensor) and reward.ndim > 1:
+        return f"returned {describe(reward)}; {_floating(num_envs)}"
     if problem is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
         return problem
     # ManiSkill's own sparse reward is `success` itself where a task has no `fail`.

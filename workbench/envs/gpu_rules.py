@@ -730,7 +730,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             ## How it is checked
             {watched}
             It looks at each reward of the open mode. ManiSkill's own sparse reward, which is `success`
-            itself, passes.
+            itself, passes. With one env a reward of shape () passes, and one of shape (1, 1) does not.
             """,
         ),
         _gpu_rule(

@@ -18,6 +18,7 @@ from workbench.envs.broken_rule import (
     in_brackets,
     place_of_class,
     place_of_hook,
+    place_of_return,
     warn_of,
 )
 from workbench.envs.error_notes import CoreRefusal, ErrorNote
@@ -186,7 +187,7 @@ class StrictMixin:
                 raise
             # ManiSkill fails with "Sizes of tensors must match": the rule's message is clearer.
             hook, problem = self._wrong_obs  # type: ignore[misc]
-            place = place_of_hook(self._workbench_task, hook)
+            place = place_of_return(self._workbench_task, hook)
             raise WrongReturn(problem, hook, "observation-rows", place) from error
         finally:
             self._wrong_obs = None
@@ -230,4 +231,4 @@ class StrictMixin:
 
     def _returned(self, rule: str, hook: str, problem: str | None) -> None:
         if problem is not None:
-            self.broken_rules.returned(rule, hook, problem, place_of_hook(self._workbench_task, hook))
+            self.broken_rules.returned(rule, hook, problem, place_of_return(self._workbench_task, hook))

@@ -122,16 +122,15 @@ single env."""
 
 
 def _may_be_of_the_batch(error: TaskError) -> bool:
-    """Whether the task may work with one env: the error is a broken rule, or it may be about a shape (from
-    torch, numpy or a check). False for refusals of the core, which have their own advice."""
+    """Whether the task may be written for one env: the error is a broken rule, or it may be about a shape (from
+    torch or numpy). False for refusals of the core, which have their own advice, and for wrong return values, which
+    one env hides: their message names the shape that is right with any number of envs."""
     cause = error.__cause__
-    if isinstance(cause, BrokenRule):
-        return True
-    if isinstance(cause, CoreRefusal | BackendUnavailable):
+    if error.problem.stage == "returns" or isinstance(cause, BackendUnavailable):
         return False
-    return error.problem.stage == "returns" or isinstance(
-        cause, RuntimeError | ValueError | TypeError | IndexError
-    )
+    if isinstance(cause, CoreRefusal):
+        return isinstance(cause, BrokenRule)
+    return isinstance(cause, RuntimeError | ValueError | TypeError | IndexError)
 
 
 def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions, tried: int) -> bool:

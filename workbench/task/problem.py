@@ -15,6 +15,7 @@ from typing import TypeGuard
 
 from workbench.envs.error_notes import CoreRefusal, ErrorNote, chain_of, notes_of
 from workbench.machine.library_files import is_installed
+from workbench.machine.parse_python import line_of_return
 
 HOOK_STAGES: dict[str, str] = {
     "_load_agent": "build",
@@ -309,14 +310,15 @@ def check_step_returns(
 def problem_from_return(cls: type, hook: str, message: str, source_files: Collection[Path]) -> Problem:
     """Problem for a wrong return value of `hook` of `cls`; `message` describes it.
 
-    For a reward, file and line are those of the reward hook that the author defined: ManiSkill calls the
-    normalized hook, which may call the author's dense hook.
+    File and line are those of the hook's only ``return``, or of its ``def`` if it has several. For a reward, the hook is
+    the one that the author defined: ManiSkill calls the normalized hook, which may call the author's dense hook.
     """
     hooks = _REWARD_HOOKS if hook in _REWARD_HOOKS else (hook,)
     found = hook_definition(cls, hooks, source_files)
     if found is None:
         return Problem("returns", f"{hooks[0]}() {message}", None, None, None, "")
-    name, (file, line) = found
+    name, (file, defined) = found
+    line = line_of_return(file, defined)
     code = linecache.getline(file, line).strip() or None
     return Problem("returns", f"{name}() {message}", file, line, code, "")
 
