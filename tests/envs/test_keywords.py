@@ -115,6 +115,19 @@ def test_modes_offer_what_the_class_supports_and_the_current_one() -> None:
     assert modes["reward_mode"].value == '"dense"'
 
 
+def test_a_robot_given_as_a_class_is_shown_by_its_uid_or_name() -> None:
+    class Hopper:
+        uid = "hopper"
+
+    class Plain: ...
+
+    for robots, shows in ((Hopper, "hopper"), (Plain, "Plain"), ((Hopper, "panda"), "hopper, panda")):
+        env = Base()
+        env.robot_uids = robots
+        robot = describe_keywords(Task, env, {}, {}, Base).modes[0]
+        assert robot.fixed and robot.value == shows
+
+
 def test_json_values_become_the_types_that_the_class_takes() -> None:
     given = {"robot_uids": ["panda", "panda"], "colour": "blue", "noise": 1}
     taken = constructor_arguments(Task, given, Base)

@@ -232,10 +232,19 @@ def as_json(value: Any) -> str | None:
 
 
 def _in_words(value: Any) -> str:
+    several = value if isinstance(value, tuple | list) else (value,)
+    if several and all(isinstance(one, str | type) for one in several):
+        # Agent classes in place of their uids.
+        return _short(", ".join(one if isinstance(one, str) else _name_of(one) for one in several))
     try:
         return _short(repr(value))
     except Exception:  # raised by the author's __repr__
         return type(value).__name__
+
+
+def _name_of(cls: type) -> str:
+    uid = getattr(cls, "uid", None)
+    return uid if isinstance(uid, str) else cls.__name__
 
 
 def _short(text: str) -> str:
