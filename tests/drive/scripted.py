@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -66,6 +66,7 @@ class ScriptedWorker:
         on_death: Callable[[Death], None],
         on_busy: Callable[[Busy | None], None],
         own_files: Callable[[], list[str]],
+        texts: Callable[[bool], Mapping[str, str]],
         output: Output,
     ) -> None:
         self._task, self._start, self._evaluate = task, poses, evaluate

@@ -46,7 +46,7 @@ from workbench.live.events import (
     WorkerDied,
 )
 from workbench.live.history.env_table import EnvRows
-from workbench.live.loading import files_at_fault, first_requests, watched_files
+from workbench.live.loading import executed_texts, files_at_fault, first_requests, watched_files
 from workbench.live.messages import Answer, Event, Loaded, Progress, Request, Settings, TaskFailed, WarmUp
 from workbench.live.policies import ListPolicies, PolicySearch
 from workbench.live.process.ask import Background, QuestionClient
@@ -162,6 +162,7 @@ class Session:
             on_death=self._on_death,
             on_busy=lambda busy: self.happen(WorkerBusy(busy)),
             own_files=lambda: self.look(lambda run: run.own_files),
+            texts=lambda loading: self.look(lambda run: executed_texts(run, loading)),
             output=self._printed.feed,
         )
         self._background = Background()

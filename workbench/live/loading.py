@@ -251,7 +251,7 @@ def _refuse_options(run: Run, failed: TaskOptions | None) -> tuple[Run, bool]:
 def died(run: Run, event: WorkerDied, now: Now) -> Run:
     death, recovery = event.death, run.recovery
     while_loading = recovery.loading
-    texts = _texts(run)
+    texts = executed_texts(run, while_loading)
     run = replace(
         run,
         recovery=recovery.died(death.end is End.DIED, death.doing is None, now.monotonic, run.newest_moment),
@@ -279,11 +279,11 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
     )
 
 
-def _texts(run: Run) -> Mapping[str, str]:
-    """Source by path of the version that is being loaded (empty if unknown), or of the running version if
-    none is being loaded."""
+def executed_texts(run: Run, while_loading: bool) -> Mapping[str, str]:
+    """Source by path of the version that is being loaded (empty if unknown), or of the running version if the worker is
+    not loading."""
     recovery = run.recovery
-    if not recovery.loading:
+    if not while_loading:
         return {} if run.task is None else run.task.source
     if recovery.restoring:
         return recovery.good_source or {}

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from workbench.live.process.heartbeat import author_place, death_problem, fatal_error, hook_of, parse_stack
+from workbench.live.process.heartbeat import (
+    author_place,
+    busy_at,
+    death_problem,
+    fatal_error,
+    hook_of,
+    parse_stack,
+)
 
 TASK = """import faulthandler, sys, ctypes
 def deep():
@@ -33,6 +40,16 @@ def test_the_authors_line_is_found_for_any_file_name(child_process: None, tmp_pa
     assert author_place(frames, [str(file)])[:2] == (str(file), 3)
     assert hook_of(frames) == "evaluate"
     assert author_place(frames, ["/elsewhere.py"]) == (None, None, None)
+
+
+def test_a_long_call_is_shown_with_the_text_that_runs(child_process: None, tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    dump = dump_of(file, "faulthandler.dump_traceback(all_threads=False)")
+    ran = file.read_text()
+    file.write_text(ran.replace("faulthandler.dump_traceback", "edited_since"))
+    busy = busy_at(9.0, "stepping", dump, [str(file)], False, texts={str(file): ran})
+    assert (busy.file, busy.line) == (str(file), 3)
+    assert "dump_traceback" in (busy.code or "") and "edited_since" not in busy.traceback
 
 
 def test_a_crash_is_reported_with_its_kind(child_process: None, tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ class Supervised:
             on_death=self.deaths.append,
             on_busy=self.busy.append,
             own_files=lambda: [str(SMALL_WORKER)],
+            texts=lambda loading: {},
             output=lambda stream, piece: False,
         )
 

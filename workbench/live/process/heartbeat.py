@@ -131,17 +131,22 @@ def busy_at(
     own_files: Iterable[str],
     ignores_interrupt: bool,
     held: bool = False,
+    texts: Mapping[str, str] | None = None,
 ) -> Busy:
-    """`Busy` from the worker's stack; `dump` may be empty."""
+    """`Busy` from the worker's stack; `dump` may be empty.
+
+    Args:
+        texts: as for `as_traceback`.
+    """
     frames = parse_stack(dump)
-    hook, (file, line, code) = hook_of(frames), author_place(frames, own_files)
+    hook, (file, line, code) = hook_of(frames), author_place(frames, own_files, texts)
     return Busy(
         seconds=seconds,
         doing=f"in {hook}" if hook is not None else doing,
         file=file,
         line=line,
         code=code,
-        traceback=as_traceback(frames),
+        traceback=as_traceback(frames, texts),
         drawing=doing == "drawing" and hook is None,
         getting_ready=doing in ("starting", "warming up") and hook is None,
         ignores_interrupt=ignores_interrupt,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -202,6 +202,7 @@ class Supervisor:
         on_death: Callable[[Death], None],
         on_busy: Callable[[Busy | None], None],
         own_files: Callable[[], list[str]],
+        texts: Callable[[bool], Mapping[str, str]],
         output: Output,
     ) -> None:
         """The callbacks are called on this object's threads, and may call `send`, `replace` and `interrupt`.
@@ -210,6 +211,8 @@ class Supervisor:
             first_requests: returns the requests that restore the previous worker's state in a new worker.
             on_busy: called about once a second during a long piece of work, and with None at its end.
             own_files: returns the author's files, to find the author's line in a stack.
+            texts: returns the source by path of the version that is loading (True) or running (False): the files may have
+                been edited since. A missing file is read.
             output: as for `WorkerProcess`.
         """
         self._options, self._warm_up = options, warm_up
@@ -219,7 +222,7 @@ class Supervisor:
             on_death,
             on_busy,
         )
-        self._own_files, self._output = own_files, output
+        self._own_files, self._texts, self._output = own_files, texts, output
         self._condition = threading.Condition()
         self._worker: WorkerProcess | None = None
         self._spare: SpareWorker | None = SpareWorker(warm_up) if options.spare else None
@@ -486,9 +489,8 @@ class Supervisor:
             state.reported = now
             self._read_stack(worker, state, beat)
             ignores_interrupt = (self._since_interrupt(beat) or 0.0) > _INTERRUPT_TIMEOUT_SECONDS
-            self._on_busy(
-                busy_at(seconds, beat.doing, state.stack, self._own_files(), ignores_interrupt, beat.held)
-            )
+            own, texts = self._own_files(), self._texts(beat.doing == "loading")
+            self._on_busy(busy_at(seconds, beat.doing, state.stack, own, ignores_interrupt, beat.held, texts))
 
     def _check_memory(self, worker: WorkerProcess, state: _WorkerState) -> None:
         limit = self._options.memory_limit
