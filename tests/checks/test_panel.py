@@ -155,6 +155,14 @@ def test_one_line_shows_the_progress(checks: ChecksView, says: str) -> None:
     assert says in status_html(checks, [])
 
 
+@pytest.mark.parametrize("before", [(), (FOUND,)])
+def test_a_version_that_is_not_checked_names_the_choice_that_turned_checks_off(
+    before: tuple[Finding, ...],
+) -> None:
+    on, off = (status_html(ChecksView(before=before, after_each_save=each), []) for each in (True, False))
+    assert AFTER_SAVE in off and AFTER_SAVE not in on
+
+
 def test_only_a_running_check_can_be_stopped(checks: Checks) -> None:
     checks.draw(ChecksView("checking", total=58))
     assert not checks.live.shows(CHECK_NOW)

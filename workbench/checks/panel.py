@@ -25,7 +25,7 @@ from workbench.page.widgets.visitors import Visitor
 TAB = "Checks"
 CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
 AFTER_SAVE = "After each save"
-AFTER_SAVE_HINT = "Check each version that loads, in a separate process at low priority: playing goes first."
+AFTER_SAVE_HINT = "Check each version that loads, in a separate process at low priority: playing goes first. The choice is kept for later runs."
 REST = "rest"
 """Key of the foldable part that lists the rules without a finding."""
 
