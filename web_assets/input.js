@@ -34,7 +34,7 @@
   const TWICE = 450; // maximum milliseconds between the presses of a double press
   const NOTICE = 8000; // milliseconds
   const DRAWN = 1000; // milliseconds within which the server redraws an entered value
-  const OPENING = 1000; // milliseconds within which a window opens
+  const OPENING = 10000; // milliseconds within which a window opens; a slow browser needs seconds for its first frames
   const AWAY = 1500; // milliseconds without a connection before the notice is shown
 
   // --- the channel ------------------------------------------------------------------------------------------------------
@@ -91,6 +91,7 @@
       newest.delete(of);
     }
     if (of && !isUnanswered(of)) keepEntered(of, refused);
+    if (refused) opening = 0;
     if (refused && of) showValues(of);
     showValues();
   }
@@ -248,6 +249,7 @@
   const NAMES = { " ": "space" };
   const OPENS = /^ctrl\+(k|o|shift\+p)$/; // keys of the palette and of the list of tasks
   let opening = 0; // time until which a window may open; keys typed meanwhile are meant for it and trigger nothing here
+  let typedEarly = ""; // what was typed meanwhile
   const PRESSED = "[data-do], [data-copy], [data-fold]";
   let keys = []; // [key, context, command, repeats]; kept while a folded panel removes them from the page
   let always = [];
@@ -283,6 +285,20 @@
     const found = keys.filter(([key, context]) => key === name && on.includes(context));
     return found.sort((a, b) => on.indexOf(a[1]) - on.indexOf(b[1]))[0];
   }
+
+  // viser opens the palette unless an input has the focus; the server opens the list of tasks.
+  function opens(event) {
+    const name = nameOf(event);
+    return OPENS.test(name) && (name === "ctrl+o" ? keyed(event) : !document.activeElement?.matches("input, textarea, select"));
+  }
+
+  // The field of the opened window gets what was typed before it had the focus. Later: the field may still be selecting its text.
+  addEventListener("focusin", ({ target }) => {
+    if (!target.closest?.(TYPED) || performance.now() >= opening) return;
+    opening = 0;
+    queueMicrotask(() => typedEarly && document.execCommand("insertText", false, typedEarly));
+  }, true);
+  addEventListener("pointerdown", () => (opening = 0), true);
 
   // Shows a copy of the list: a redraw may remove the original.
   function toggleKeyList() {
@@ -368,10 +384,11 @@
       if (byPointer && event.target.matches?.(CLOSED)) event.target.blur();
       byPointer = false;
       const at = document.activeElement ?? document.body;
-      const now = performance.now();
       if (event.key === "Escape" || at.closest(TYPED)) opening = 0;
-      else if (OPENS.test(nameOf(event))) opening = now + OPENING;
-      else if (now < opening && !event.ctrlKey && !event.metaKey && !event.altKey) {
+      else if (opens(event)) [opening, typedEarly] = [performance.now() + OPENING, performance.now() < opening ? typedEarly : ""];
+      else if (performance.now() < opening && !event.ctrlKey && !event.metaKey && !event.altKey) {
+        if (event.key.length === 1) typedEarly += event.key;
+        if (event.key === "Backspace") typedEarly = typedEarly.slice(0, -1);
         event.preventDefault();
         event.stopImmediatePropagation();
         return;

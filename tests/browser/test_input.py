@@ -281,21 +281,56 @@ def test_a_key_is_its_letter_in_any_layout(small: SmallPage, event: str, command
     small.has(*commands, FrameScene())
 
 
-def test_letters_right_after_the_palette_key_do_not_act_on_the_page(small: SmallPage) -> None:
-    small.page.evaluate(
-        """() => {
-            const press = (what) =>
-                document.body.dispatchEvent(new KeyboardEvent("keydown", {bubbles: true, cancelable: true, ...what}));
-            press({key: "k", code: "KeyK", ctrlKey: true});
-            press({key: "s", code: "KeyS"});
-        }"""
-    )
-    palette = small.page.get_by_placeholder("Search commands...")
+HOLD_FRAMES_JS = """() => {
+    [window.heldFrames, window.frameOf] = [[], requestAnimationFrame];
+    window.requestAnimationFrame = (then) => window.heldFrames.push(then);
+}"""
+RELEASE_FRAMES_JS = """() => {
+    window.requestAnimationFrame = frameOf;
+    for (const then of window.heldFrames) requestAnimationFrame(then);
+}"""
+
+
+def test_letters_typed_before_the_palette_has_opened_go_into_its_field(small: SmallPage) -> None:
+    page = small.page
+    palette = page.get_by_placeholder("Search commands...")
+    page.evaluate(HOLD_FRAMES_JS)  # as in a browser that needs seconds for a frame
+    page.keyboard.press("Control+k")
+    page.keyboard.type("sf")
+    page.keyboard.press("Control+k")
+    page.keyboard.type("xs")
+    page.keyboard.press("Backspace")
+    assert not palette.is_visible()
+    page.evaluate(RELEASE_FRAMES_JS)
     expect(palette).to_be_focused()
-    small.page.keyboard.type("f")
-    expect(palette).to_have_value("f")
-    small.page.keyboard.press("Escape")
+    page.keyboard.type("f")
+    expect(palette).to_have_value("sfxf")
+    page.keyboard.press("Escape")
     expect(palette).to_have_count(0)
+    page.keyboard.press("f")
+    small.has(FrameScene())
+
+
+def test_escape_before_the_palette_has_opened_drops_what_was_typed(small: SmallPage) -> None:
+    page = small.page
+    palette = page.get_by_placeholder("Search commands...")
+    page.evaluate(HOLD_FRAMES_JS)
+    page.keyboard.press("Control+k")
+    page.keyboard.type("s")
+    page.keyboard.press("Escape")
+    page.evaluate(RELEASE_FRAMES_JS)
+    page.keyboard.press("f")
+    small.has(FrameScene())
+    page.keyboard.press("Control+k")
+    expect(palette).to_be_focused()
+    expect(palette).to_have_value("")
+    page.keyboard.press("Escape")
+    expect(palette).to_have_count(0)
+
+
+def test_the_palette_key_in_a_field_opens_nothing_and_holds_no_keys(small: SmallPage) -> None:
+    small.page.get_by_label("Pause").focus()
+    small.page.keyboard.press("Control+k")
     small.page.keyboard.press("f")
     small.has(FrameScene())
 

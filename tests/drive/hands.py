@@ -9,20 +9,31 @@ import numpy as np
 from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
+from workbench.envs.scene.shapes import BodyKind
 from workbench.hands.panel import HandsPanel
 
 OFFSET = np.array([5.0, 0.0, 0.0])
 MIDDLE = np.zeros(3)
 PAGE = 3
+EYE = OFFSET + [1.0, 0.0, 1.0]
+"""Position of the page's camera in the view."""
 
 
 class Hands:
-    """A panel on its own, with `body` selected in env 1 of 3."""
+    """A panel on its own, with `body` selected in env 1 of 3; `kind` replaces the body's kind."""
 
-    def __init__(self, panels: Panels, body: str = "cube", playing: bool = False) -> None:
+    def __init__(
+        self, panels: Panels, body: str = "cube", playing: bool = False, kind: BodyKind | None = None
+    ) -> None:
         self.session = StubSession()
         self.panel = HandsPanel(panels.server, self.session, lambda: body)  # type: ignore[arg-type]
         self.view = replace(running(3, selected_env=1), playing=playing)
+        assert self.view.task is not None
+        if kind is not None:
+            geometry = self.view.task.geometry
+            kinds = dict(zip(geometry.body_names, geometry.body_kinds, strict=True)) | {body: kind}
+            task = replace(self.view.task, geometry=replace(geometry, body_kinds=tuple(kinds.values())))
+            self.view = replace(self.view, task=task)
         assert self.view.task is not None and self.view.step is not None
         self.session.shown, self.poses = self.view, self.view.step.poses
         self.geometry = self.view.task.geometry
@@ -36,9 +47,9 @@ class Hands:
         self.panel.draw(self.view)
         return moved
 
-    def drag(self, *ends: np.ndarray, grabbed: np.ndarray = MIDDLE) -> None:
+    def drag(self, *ends: np.ndarray, grabbed: np.ndarray = MIDDLE, lifts: bool = False) -> None:
         """Drag from `grabbed`, relative to the body's origin, through `ends`, in the env's frame."""
         start = self.pose[:3] + grabbed + OFFSET
         phases = ["start", *["update"] * (len(ends) - 1)]
         for phase, end in zip(phases, ends, strict=True):
-            self.panel.drag(PAGE, phase, start, end + OFFSET)  # type: ignore[arg-type]
+            self.panel.drag(PAGE, phase, start, end + OFFSET, EYE, lifts)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.drive.hands import OFFSET, PAGE, Hands
+from tests.drive.hands import EYE, OFFSET, PAGE, Hands
 from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.drive.scenes import changed, running
@@ -38,18 +38,45 @@ def words_of(html: str) -> str:
     return " ".join(re.sub("<[^>]*>", "", html).split())
 
 
-def test_a_paused_body_follows_the_pointer_and_is_moved_at_the_end(panels: Panels) -> None:
+def test_a_paused_body_follows_the_pointer_parallel_to_the_ground(panels: Panels) -> None:
     hands, grabbed = Hands(panels), np.array([0.01, 0.0, 0.02])
-    hands.drag(hands.pose[:3] + grabbed, np.array([0.3, 0.2, 0.1]), grabbed=grabbed)
+    hands.drag(hands.pose[:3] + grabbed, np.array([0.3, 0.2, 0.52]), grabbed=grabbed)
     drawn = hands.redraw()[1, hands.geometry.body_names.index("cube")]
-    np.testing.assert_allclose(drawn[:3], [0.29, 0.2, 0.08], atol=1e-6)
+    # The ray from (1, 0, 1) comes down to the grabbed point's height of 0.04 at twice its length.
+    np.testing.assert_allclose(drawn[:3], [-0.41, 0.4, 0.02], atol=1e-6)
     assert not hands.session.asked, "only the page shows it until the drag ends"
-    end = np.array([0.4, 0.2, 0.1]) + OFFSET
-    hands.panel.drag(PAGE, "end", end, end)
+    end = np.array([0.4, 0.2, 0.04]) + OFFSET
+    hands.panel.drag(PAGE, "end", end, end, EYE)
     (moved,) = hands.session.asked
     assert isinstance(moved, BodyMoved) and (moved.body, moved.env_idx) == ("cube", (1,))
-    np.testing.assert_allclose(moved.pose, [0.39, 0.2, 0.08, 1, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(moved.pose, [0.39, 0.2, 0.02, 1, 0, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(hands.redraw(), hands.poses)
+
+
+def test_with_shift_a_paused_body_moves_up_and_down_only(panels: Panels) -> None:
+    hands = Hands(panels)
+    hands.drag(hands.pose[:3], np.array([0.505, 0.3, 0.7]), lifts=True)
+    drawn = hands.redraw()[1, hands.geometry.body_names.index("cube")]
+    assert drawn[:2] == pytest.approx(hands.pose[:2]) and drawn[2] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("pointer", "lifts"), [([0.5, 0.0, 1.0], False), ([0.5, 0.0, 0.99], False), ([1.0, 0.0, 0.5], True)]
+)
+def test_a_pointer_at_the_horizon_moves_nothing(panels: Panels, pointer: list[float], lifts: bool) -> None:
+    hands = Hands(panels)
+    hands.drag(hands.pose[:3], np.array(pointer), lifts=lifts)
+    np.testing.assert_allclose(hands.redraw(), hands.poses, atol=1e-6)
+
+
+def test_a_small_kinematic_body_is_dragged_while_paused(panels: Panels) -> None:
+    hands = Hands(panels, kind="kinematic")
+    assert panels.nodes("/hands/grip")
+    hands.drag(hands.pose[:3])
+    end = np.array([0.4, 0.2, 0.02]) + OFFSET
+    hands.panel.drag(PAGE, "end", end, end, EYE)
+    (moved,) = hands.session.asked
+    assert moved.pose[:3] == pytest.approx([0.4, 0.2, 0.02], abs=1e-6)
 
 
 def test_a_drag_moves_the_body_of_the_env_in_which_it_began(panels: Panels) -> None:
@@ -59,7 +86,7 @@ def test_a_drag_moves_the_body_of_the_env_in_which_it_began(panels: Panels) -> N
     hands.session.shown = hands.view
     hands.redraw()
     end = np.array([0.4, 0.2, 0.1]) + OFFSET
-    hands.panel.drag(PAGE, "end", end, end)
+    hands.panel.drag(PAGE, "end", end, end, EYE)
     (moved,) = hands.session.asked
     assert moved.env_idx == (1,)
 
@@ -87,7 +114,7 @@ def test_a_playing_body_is_pulled_at_the_grabbed_point_until_the_drag_ends(panel
     np.testing.assert_allclose(pull.target, [0, 0, 0.5], atol=1e-6)
     np.testing.assert_array_equal(hands.redraw(), hands.poses)
     assert [text for text in panels.labels() if text.endswith(" N")]
-    hands.panel.drag(PAGE, "end", OFFSET, OFFSET)
+    hands.panel.drag(PAGE, "end", OFFSET, OFFSET, EYE)
     assert hands.session.asked[-1] == BodyPulled(PullBody())
     hands.redraw()
     assert not [text for text in panels.labels() if text.endswith(" N")]
@@ -103,7 +130,7 @@ def test_a_page_that_closes_during_a_pull_lets_go(panels: Panels) -> None:
 def test_another_page_does_not_take_the_body_out_of_the_hand(panels: Panels) -> None:
     hands = Hands(panels)
     hands.drag(hands.pose[:3])
-    hands.panel.drag(PAGE + 1, "update", OFFSET, OFFSET + 1)
+    hands.panel.drag(PAGE + 1, "update", OFFSET, OFFSET + 1, EYE)
     np.testing.assert_array_equal(hands.redraw(), hands.poses)
 
 

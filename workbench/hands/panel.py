@@ -59,10 +59,21 @@ TITLE = "Move"
 GIZMO_PIXELS = 76.0
 MIN_GRIP_METRES = 0.01
 """Minimum side of the box that is dragged, so that a thin body can be hit."""
+MAX_KINEMATIC_METRES = 1.0
+"""Maximum side of a kinematic body that a drag moves. A table fills the view: after a click on it, a drag that is
+meant to turn the view must not move it."""
+MAX_RAY = 4.0
+"""Maximum distance of a moved point from the page's camera, as a multiple of its distance in the view's plane. Near
+the horizon a pixel is many metres."""
 HINT = (
-    "Drag the body in the view: while the envs play, a spring pulls it; while they are paused, it moves. "
-    "Shift+U undoes a move."
+    "Drag the body in the view: while the envs play, a spring pulls it; while they are paused, it moves parallel "
+    "to the ground, and with Shift up and down. Shift+U undoes a move."
 )
+KINEMATIC_HINT = (
+    "Pause, and drag the body in the view: it moves parallel to the ground, and with Shift up and down. Forces do "
+    "not move a kinematic body. Shift+U undoes a move."
+)
+LARGE_HINT = "The body is large: a drag turns the view. Pause, and move it by handles (M) or numbers."
 
 
 @dataclass(frozen=True)
@@ -97,7 +108,7 @@ class _Drag:
     pose: Floats
     """(7,) where the body is moved to; for a pull, where it was when the drag began."""
     target: Floats
-    """(3,) where the grabbed point is pulled to, in the env's frame."""
+    """(3,) where the grabbed point is pulled to, in the env's frame; for a move, where it was when the drag began."""
 
 
 class HandsPanel(PagePart[SessionView]):
@@ -152,6 +163,7 @@ class HandsPanel(PagePart[SessionView]):
     def _add_grip(self, **place: object) -> viser.BoxHandle:
         box = self._server.scene.add_box("/hands/grip", color=COLOUR, opacity=0.15, **place)  # type: ignore[arg-type]
         box.on_drag(self._on_drag)
+        box.on_drag("left", modifier="shift")(self._on_drag)
         return box
 
     # --- the panel -----------------------------------------------------------------------------------
@@ -179,10 +191,8 @@ class HandsPanel(PagePart[SessionView]):
         self._position.show([round(float(value), 4) for value in known.pose[:3]], off=bool(why))
         self._angles.show(degrees, off=bool(why))
         self._scope.show(view.of(Hands).all_envs, off=bool(why))
-        note = why or HINT
-        if known.kind == "link":
-            note = why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu") or why
-        self._note.content, self._note.visible = render("note", text=note), True
+        on_gpu = view.task is not None and view.task.backend == "gpu"
+        self._note.content, self._note.visible = render("note", text=_note(known, on_gpu)), True
         handles = Tool(
             "Handles", ToggleHandles(), with_key(ToggleHandles), on=self._handles_on, off=bool(why)
         )
@@ -319,10 +329,11 @@ class HandsPanel(PagePart[SessionView]):
     # Async, since viser runs callbacks that are not async in its thread pool, in any order.
     async def _on_drag(self, event: viser.SceneNodeDragEvent) -> None:
         start, end = np.array(event.start_position), np.array(event.end_position)
+        eye, lifts = np.array(event.client.camera.position), event.modifier == "shift"
 
         def handle() -> None:
             with refusals_shown(event.client, then=self.let_go):
-                self.drag(event.client_id, event.phase, start, end)
+                self.drag(event.client_id, event.phase, start, end, eye, lifts)
 
         post(handle)
 
@@ -330,13 +341,17 @@ class HandsPanel(PagePart[SessionView]):
         pose = np.concatenate([event.target.position, event.target.wxyz])
         post(partial(self._turned, event.client, event.phase, pose))
 
-    def drag(self, client: int, phase: Phase, start: Floats, end: Floats) -> None:
-        """Handle a drag of the selected body with the mouse.
+    def drag(
+        self, client: int, phase: Phase, start: Floats, end: Floats, eye: Floats, lifts: bool = False
+    ) -> None:
+        """Handle a drag of the selected body with the mouse. A move is parallel to the ground, or vertical.
 
         Args:
             client: id of the page.
             start: (3,) the point of the body at which it is held, in the view.
             end: (3,) the pointer, in the plane through `start` that faces the page's camera.
+            eye: (3,) position of the page's camera in the view.
+            lifts: whether a move is vertical.
 
         Raises:
             Refused: the body can neither be moved nor pulled now.
@@ -346,12 +361,13 @@ class HandsPanel(PagePart[SessionView]):
         drag = self._drag
         if drag is None or drag.client != client:
             return
-        target = end - drag.of.offset
         if drag.how == "pull":
-            self._pull(drag, target)
+            self._pull(drag, end - drag.of.offset)
         else:
+            target = moved_point(drag.target, eye - drag.of.offset, end - drag.of.offset, lifts)
             turned = SO3(drag.of.pose[3:]).apply(drag.grabbed)
-            self._drag = _with_pose(drag, np.concatenate([target - turned, drag.of.pose[3:]]))
+            if target is not None:
+                self._drag = _with_pose(drag, np.concatenate([target - turned, drag.of.pose[3:]]))
         if phase == "end":
             self._end()
 
@@ -419,14 +435,43 @@ def scope_choice(server: viser.ViserServer) -> Field:
     )
 
 
+def moved_point(point: Floats, eye: Floats, pointer: Floats, lifts: bool) -> Floats | None:
+    """Where a grabbed point is moved to: where the ray through the pointer meets the horizontal plane through the point,
+    or, if `lifts`, comes closest to the vertical line through it. None if that is behind the camera or too far away.
+
+    Args:
+        point: (3,) the point when the drag began.
+        eye: (3,) the page's camera.
+        pointer: (3,) a point under the pointer, as far from the camera as `point`.
+    """
+    ray, gap = pointer - eye, point - eye
+    above, below = (gap[:2] @ ray[:2], ray[:2] @ ray[:2]) if lifts else (gap[2], ray[2])
+    if not abs(above) <= MAX_RAY * abs(below) or above * below <= 0:
+        return None
+    met = eye + above / below * ray
+    return np.array([*point[:2], met[2]] if lifts else [*met[:2], point[2]])
+
+
+def _is_large(known: Selected) -> bool:
+    return known.kind == "kinematic" and bool(np.max(known.box[1] - known.box[0]) > MAX_KINEMATIC_METRES)
+
+
+def _note(known: Selected, on_gpu: bool) -> str:
+    """How to move the body, or why it cannot be moved."""
+    if known.kind == "kinematic":
+        return LARGE_HINT if _is_large(known) else KINEMATIC_HINT
+    if known.kind == "link" and (why := why_not_pulled(known.kind, on_gpu)):
+        return why
+    return why_not_moved(known.kind) or HINT
+
+
 def _can_be_dragged(known: Selected, view: SessionView) -> bool:
     """Whether a drag on the body moves or pulls it now; if not, the drag turns the view."""
     if view.timeline.shown is not None:
         return False
     if view.playing:
         return not why_not_pulled(known.kind, view.task is not None and view.task.backend == "gpu")
-    # Not kinematic: after a stray click on a table, the next drag must not move the table.
-    return known.kind == "dynamic"
+    return not why_not_moved(known.kind) and not _is_large(known)
 
 
 def _steps(view: SessionView, env: int) -> int:
