@@ -12,14 +12,46 @@ from tests.drive.session import wait_until
 from tests.drive.tabs import camera_message, handshake, messages_in
 from tests.drive.waiting import until
 from workbench.app.pages import Which
+from workbench.app.recording_problems import RecordingProblems
 from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import Step
 from workbench.live.events import EnvsReset
 from workbench.page.door.gated_server import GatedServer
+from workbench.record.commands import StopRecording
 from workbench.record.saving_state import SaveWanted
 from workbench.record.state import RecordingStatus, RecordingWanted
 from workbench.task.description import TaskOptions
+
+
+def bodies(frame: object) -> list[str]:
+    """Texts of the notices in a frame of the server."""
+    assert isinstance(frame, bytes)
+    shown = [one for one in messages_in(frame) if one["type"] == "NotificationShowMessage"]
+    return [message["props"]["body"] for message in shown]
+
+
+@pytest.mark.usefixtures("child_process")
+def test_a_page_shows_how_many_episodes_a_recording_saved_and_where(
+    tmp_path: Path, gated_server: GatedServer
+) -> None:
+    session = Session(
+        str(tmp_path / "push.py"), TaskOptions(num_envs=2), recordings=tmp_path, make_worker=scripted(2)
+    )
+    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+    reports = RecordingProblems(gated_server.server, lambda: session, lambda problem: None)
+    address, how = handshake(gated_server.url)
+    with websockets.sync.client.connect(address, **how) as connection:
+        connection.send(camera_message())
+        until(lambda: gated_server.server.get_clients(), "the client")
+        session.happen(RecordingWanted())
+        session.do(Step())
+        wait_until(session, lambda view: view.of(RecordingStatus).steps == 2, "a step of both envs")
+        session.do(StopRecording())
+        (told,) = until(lambda: bodies(connection.recv(timeout=30)), "the notice")
+    assert "2 episodes" in told and str(tmp_path) in told
+    reports.close()
+    session.close()
 
 
 @pytest.mark.usefixtures("child_process")
@@ -45,13 +77,7 @@ def test_each_page_shows_a_recording_problem(page: Which, tmp_path: Path, gated_
         until(lambda: gated_server.server.get_clients(), "the client")
 
         def tells(number: int) -> bool:
-            frame = connection.recv(timeout=30)
-            assert isinstance(frame, bytes)
-            texts = [
-                message["props"]["body"]
-                for message in messages_in(frame)
-                if message["type"] == "NotificationShowMessage"
-            ]
+            texts = bodies(connection.recv(timeout=30))
             return any(str(folder) in text for text in texts) and len(notices) == number
 
         for number in (1, 2):

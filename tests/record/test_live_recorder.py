@@ -58,6 +58,7 @@ def test_an_episode_cut_off_by_a_stop_or_a_death_is_written(child_process: None,
                 "the file",
             )
             assert (status.active, status.problem, status.being_written) == (False, None, 0)
+            until(lambda: fake.view.of(RecordingStatus).saved == 1, "the number of saved episodes")
             assert read_episode(Path(str(status.last_file))).info.env_index == 2
         assert len(list(tmp_path.glob("*.rrd"))) == 2
 

@@ -1,27 +1,31 @@
-"""Reports why something was not recorded: to every open browser, on any page and tab, and to the terminal."""
+"""Reports what a recording saved, and why something was not recorded, to every open browser, on any page and tab."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from weakref import WeakKeyDictionary
 
 import viser
 
 from workbench.app.session import Session
 from workbench.machine.loop import begin, do
 from workbench.page.widgets.notices import notify_all
+from workbench.page.widgets.templates import counted
 from workbench.record.state import RecordingStatus
 
 _POLL_SECONDS = 0.2
 REFUSED_SECONDS = 8.0
+SAVED_SECONDS = 10.0
 
 
 class RecordingProblems:
-    """Watches the live session for recording problems. The session records also while another page is shown.
+    """Watches the live session for ends of recordings and for problems. The session records also while another page is
+    shown.
 
     Args:
         session: Returns the live session, if there is one.
-        on_notice: Called with a message for the terminal.
+        on_notice: Called with a message about a problem, for the terminal.
     """
 
     def __init__(
@@ -31,7 +35,7 @@ class RecordingProblems:
         on_notice: Callable[[str], None],
     ) -> None:
         self._server, self._session, self._on_notice = server, session, on_notice
-        self._before = RecordingStatus()
+        self._before = WeakKeyDictionary[Session, RecordingStatus]()
         self._watching = do(lambda: begin(self._watch()))
 
     def close(self) -> None:
@@ -42,11 +46,19 @@ class RecordingProblems:
         while True:
             session = self._session()
             if session is not None:
-                self._notify(session.view().of(RecordingStatus))
+                now = session.view().of(RecordingStatus)
+                self._notify(self._before.get(session, RecordingStatus()), now)
+                self._before[session] = now
             await asyncio.sleep(_POLL_SECONDS)
 
-    def _notify(self, now: RecordingStatus) -> None:
-        before, self._before = self._before, now
+    def _notify(self, before: RecordingStatus, now: RecordingStatus) -> None:
+        if now.saved is not None and (now.since, now.saved) != (before.since, before.saved):
+            text = (
+                f"{counted(now.saved, 'episode')} in {now.folder}"
+                if now.saved
+                else "No episode: none had a step."
+            )
+            notify_all(self._server, "Saved by the recording", text, None, SAVED_SECONDS)
         # Compare identities, not texts: the same problem may have occurred again since the last poll.
         if now.problem is not None and now.problem is not before.problem:
             self._on_notice(now.problem)

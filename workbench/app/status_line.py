@@ -18,6 +18,7 @@ from workbench.machine.text import rate_text
 from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import Clock
 from workbench.page.widgets.templates import counted, place, render
+from workbench.record.panel import SAVE
 from workbench.record.state import RecordingStatus
 from workbench.solve.state import SolveView
 from workbench.task.description import TaskDescription
@@ -143,8 +144,8 @@ def slowed_by(view: SessionView) -> tuple[str, str] | None:
         cameras = counted(len(task.cameras) if task.can_render else 0, "camera")
         envs = counted(len(view.of(RecordingStatus).env_idx), "env")
         what = f"recording {cameras} of {envs} in every step takes {recorded:.0%} of the time"
-        advice = "Save what I just saw (Episodes) records afterwards, and costs nothing while playing."
-        return "recording", f"{rate}: {what}. {advice}"
+        advice = f"{SAVE} (Episodes) records afterwards, and costs nothing while playing"
+        return f"recording; {advice}", f"{rate}: {what}. Record fewer envs, or none: {advice}."
     cameras = counted(len(view.settings.cameras), "camera")
     what = f"drawing the {cameras} that this page shows takes {watched:.0%} of the time"
     return "camera pictures", f"{rate}: {what}. Untick them on the Cameras tab."

@@ -15,6 +15,7 @@ from workbench.record.state import (
     BeginEpisodes,
     EndEpisodes,
     EpisodeEnded,
+    EpisodesEnded,
     EpisodesRecovered,
     EpisodeWritten,
     RecordEvent,
@@ -69,7 +70,7 @@ class LiveRecorder:
     def _end(self) -> None:
         gatherer, self._gatherer = self._gatherer, None
         if gatherer is not None:
-            self._aside.begin(gatherer.finish)
+            self._aside.begin(partial(self._finish, gatherer, self._number))
 
     def close(self) -> None:
         """End the running episodes, and write all files. Must not be called on the loop's thread."""
@@ -98,6 +99,10 @@ class LiveRecorder:
             sum(episode.writer.bytes_written for episode in episodes),
         )
         self._post(StepRecorded(number, what.bytes, gatherer.env_idx, under_way, problem))
+
+    def _finish(self, gatherer: EpisodeGatherer, number: int) -> None:
+        gatherer.finish()
+        self._post(EpisodesEnded(number))
 
     def _ended(self, episode: GatheredEpisode) -> None:
         self._post(EpisodeEnded(live=True))

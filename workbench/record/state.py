@@ -53,6 +53,8 @@ class RecordingStatus:
     """Number of ended episodes whose files are being made."""
     recovered: tuple[str, ...] = ()
     """.rrd files of episodes that an earlier server left unfinished, recovered at the start."""
+    saved: int | None = None
+    """Number of episodes of the last recording, once it has ended and their files are written; else None."""
     folder: str = ""
     last_file: str | None = None
     problem: str | None = None
@@ -87,6 +89,10 @@ class LiveRecording:
     since: float = 0.0
     episodes: int = 0
     """`since` and `episodes`: as in `RecordingStatus`."""
+    written_before: int = 0
+    """Number of episodes of this session that were written, or being written, when the recording began."""
+    ended: bool = False
+    """Whether the recording has ended, and all its episodes are being written."""
     under_way: RunningEpisodes = RunningEpisodes()
     waiting_bytes: int = 0
     """Bytes of steps that wait for the disk, including those of earlier recordings."""
@@ -112,6 +118,9 @@ class LiveRecording:
             episodes_written=written.count,
             being_written=self.being_written,
             recovered=self.recovered,
+            saved=max(written.count - self.written_before, 0)
+            if self.ended and not self.being_written
+            else None,
             folder=self.folder,
             last_file=None if written.last is None else str(written.last.rrd),
             problem=self.problem or written.problem,
@@ -168,6 +177,13 @@ class EpisodeEnded:
 
 
 @dataclass(frozen=True)
+class EpisodesEnded:
+    """All episodes of a gatherer have ended."""
+
+    number: int
+
+
+@dataclass(frozen=True)
 class EpisodeWritten:
     """The files of an episode are written, or could not be written."""
 
@@ -182,7 +198,7 @@ class EpisodesRecovered:
     problem: str | None
 
 
-RecordEvent = StepRecorded | EpisodeEnded | EpisodeWritten | EpisodesRecovered
+RecordEvent = StepRecorded | EpisodeEnded | EpisodesEnded | EpisodeWritten | EpisodesRecovered
 """Events of the recording."""
 
 
@@ -264,6 +280,8 @@ def _apply(
                 episodes=recording.episodes + live,
                 being_written=recording.being_written + 1,
             ), []
+        case EpisodesEnded(number=recording.number) if not recording.env_idx and recording.continues is None:
+            return replace(recording, ended=True), []
         case EpisodeWritten(finished=finished):
             return replace(recording, being_written=recording.being_written - 1, written=finished), []
         case EpisodesRecovered(files=files, problem=problem):
@@ -284,7 +302,8 @@ def _apply(
 
 
 def _new(recording: LiveRecording, now: Now) -> LiveRecording:
-    return replace(recording, since=now.wall, episodes=0)
+    before = recording.written.count + recording.being_written
+    return replace(recording, since=now.wall, episodes=0, written_before=before)
 
 
 def _start(
@@ -298,6 +317,7 @@ def _start(
         env_idx=envs,
         one_each=one_each,
         number=recording.number + 1,
+        ended=False,
         problem=None,
         saving=without_message(recording.saving),
     )
