@@ -127,6 +127,31 @@ def test_a_page_that_closes_during_a_pull_lets_go(panels: Panels) -> None:
     assert hands.session.asked[-1] == BodyPulled(PullBody())
 
 
+def test_a_reset_ends_the_pull_and_the_drag_in_the_browser(
+    panels: Panels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(panels.server, "get_clients", lambda: {PAGE: object()})
+    hands = Hands(panels, playing=True)
+
+    def at_step(step: int) -> None:
+        assert hands.view.step is not None
+        elapsed = np.full(3, step, np.int32)
+        hands.view = replace(hands.view, step=replace(hands.view.step, elapsed_steps=elapsed))
+        hands.session.shown = hands.view
+        hands.panel.follow(hands.view)
+        hands.redraw()
+
+    at_step(2)
+    hands.drag(hands.pose[:3])
+    (dragged,) = (node.name for node in panels.nodes("/hands/grip"))
+    at_step(40)
+    assert hands.session.asked[-1] != BodyPulled(PullBody())
+    at_step(5)
+    assert hands.session.asked[-1] == BodyPulled(PullBody())
+    (now,) = (node.name for node in panels.nodes("/hands/grip"))
+    assert now != dragged, "the browser would go on dragging the node"
+
+
 def test_another_page_does_not_take_the_body_out_of_the_hand(panels: Panels) -> None:
     hands = Hands(panels)
     hands.drag(hands.pose[:3])

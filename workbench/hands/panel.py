@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -92,7 +93,7 @@ class Selected:
     offset: Floats
     """(3,) position of the env in the view."""
     steps: int
-    """Control steps so far in the env's episode."""
+    """Control steps so far in the env's episode, when it was last looked at."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,9 @@ class HandsPanel(PagePart[SessionView]):
             self.spawn = SpawnPanel(server, session)
             """The range in which resets put the selected body."""
             self._change = server.gui.add_html("", visible=False)
+        self._grips = count()
+        self._ends_drag = False
+        """Whether the browser still drags, after `let_go`."""
         self._grip = InView(self._add_grip, "dimensions", "position", "wxyz")
         self._gizmo = server.scene.add_transform_controls(
             "/hands/gizmo", GIZMO_PIXELS, fixed=True, depth_test=False, visible=False
@@ -161,7 +165,9 @@ class HandsPanel(PagePart[SessionView]):
         return Field(self._server, label, kind, "to", [0.0] * 3, given=given, hint=hint, step=step)
 
     def _add_grip(self, **place: object) -> viser.BoxHandle:
-        box = self._server.scene.add_box("/hands/grip", color=COLOUR, opacity=0.15, **place)  # type: ignore[arg-type]
+        # A browser ends its drag, and removes viser's arrow, when the dragged node is gone: so each grip has another name.
+        name = f"/hands/grip_{next(self._grips)}"
+        box = self._server.scene.add_box(name, color=COLOUR, opacity=0.15, **place)  # type: ignore[arg-type]
         box.on_drag(self._on_drag)
         box.on_drag("left", modifier="shift")(self._on_drag)
         return box
@@ -254,7 +260,9 @@ class HandsPanel(PagePart[SessionView]):
         if drag is None:
             return
         if drag.how == "pull":
-            over = _steps(view, drag.of.env) < drag.of.steps
+            steps = _steps(view, drag.of.env)
+            over = steps < drag.of.steps
+            self._drag = replace(drag, of=replace(drag.of, steps=steps))
         else:
             over = view.playing or view.timeline.shown is not None
         if over or drag.client not in self._server.get_clients():
@@ -282,6 +290,9 @@ class HandsPanel(PagePart[SessionView]):
         """
         self._offset = np.asarray(offset, np.float64)
         known = self.selected = self._find(view, poses)
+        if self._ends_drag:
+            self._ends_drag = False
+            self._grip.draw()
         if known is None or not _can_be_dragged(known, view):
             self._grip.draw()
         else:
@@ -418,6 +429,7 @@ class HandsPanel(PagePart[SessionView]):
         """Cancel the drag."""
         self.spawn.let_go()
         drag, self._drag = self._drag, None
+        self._ends_drag |= drag is not None
         if drag is not None and drag.how == "pull":
             self._session.happen(BodyPulled(PullBody()))
 
