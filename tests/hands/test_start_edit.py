@@ -132,6 +132,23 @@ def test_a_text_whose_run_does_not_give_the_pose_is_refused(opened: Session, fil
     assert file.read_text() == text
 
 
+def test_what_the_seed_does_not_decide_is_not_blamed_on_the_change(opened: Session, file: Path) -> None:
+    built = MINIMAL[MINIMAL.index("        builder = ") : MINIMAL.index("    def _initialize_episode")]
+    text = MINIMAL.replace(built, built + built.replace("cube", "post") + built.replace("cube", "shadow"))
+    text = text.replace("import sapien\n", "import numpy as np\nimport sapien\n")
+    text = text.replace(
+        RESET_LINES[-1],
+        RESET_LINES[-1]
+        + "        self.post.set_pose(Pose.create_from_pq(p=[*np.random.uniform(1, 2, 2), 0.03]))\n"
+        + "        self.shadow.set_pose(Pose.create_from_pq(p=p + torch.tensor([0.0, 0.0, 1.0])))\n",
+    )
+    load(opened, file, text)
+    planned = want(opened)
+    assert planned.edit is not None, planned.message
+    named = [{name for name in ("cube", "post", "shadow") if name in note} for note in planned.edit.notes]
+    assert named == [{"shadow"}, {"post"}]
+
+
 def test_a_random_pose_is_refused(opened: Session, file: Path) -> None:
     text = MINIMAL.replace(
         "torch.tensor([0, 0, 0.03], device=self.device).repeat(len(env_idx), 1)",

@@ -106,15 +106,25 @@ class StartJobs:
         after = await self._read(job, changed, effect.seeds, texts)
         if after[0].poses.shape != before[0].poses.shape:
             raise RefusedEdit("the change would add or remove bodies")
-        unlike = partial(_unlike, before, after, task, wanted, old_texts)
-        if why := difference(after, task, wanted) or await self._aside.run(unlike):
-            raise RefusedEdit(f"a run of the changed file shows: {why}")
+        unlike = await self._aside.run(partial(_unlike, before, after, task, wanted, old_texts))
         # The links of a robot move with its joints.
         others = [] if isinstance(wanted, RobotQpos) else _moved(before, after, task, wanted.of)
-        if others:
-            note = f"{', '.join(others)} will begin elsewhere too."
-            edit = replace(edit, notes=(*edit.notes, note))
-        return edit
+        unseeded: list[str] = []
+        if unlike or others:
+            # Numbers that are not drawn from the seed differ without the change too.
+            again = await self._read(job, effect.load, effect.seeds, old_texts)
+            unseeded = _unseeded(before, again, task, wanted, others)
+        if why := difference(after, task, wanted) or ("" if wanted.of in unseeded else unlike):
+            raise RefusedEdit(f"a run of the changed file shows: {why}")
+        notes = list(edit.notes)
+        if caused := [name for name in others if name not in unseeded]:
+            notes.append(f"{', '.join(caused)} will begin elsewhere too.")
+        if unseeded:
+            notes.append(
+                f"At every run, with and without this change: {', '.join(unseeded)} begins elsewhere, because the task does "
+                "not draw it from the seed."
+            )
+        return replace(edit, notes=tuple(notes))
 
     async def _check(self, job: Job, effect: CheckStart) -> None:
         task, wanted = effect.task, effect.wanted
@@ -211,6 +221,21 @@ def _unlike(
     changes = without_noise(written, old, wanted.qpos) - written.values
     apart = np.abs(_qpos_of(after, task, wanted) - old - changes).max()
     return f"{wanted.of} begins {apart:.3g} from where the numbers put it" if apart > QPOS_TOLERANCE else ""
+
+
+def _unseeded(
+    before: Sequence[EpisodeStart],
+    again: Sequence[EpisodeStart],
+    task: TaskDescription,
+    wanted: Beginning,
+    others: Sequence[str],
+) -> list[str]:
+    """What begins elsewhere in two runs of the same text with the same seeds: those of the bodies `others`, or the robot
+    whose joints are wanted."""
+    if isinstance(wanted, RobotQpos):
+        apart = np.abs(_qpos_of(again, task, wanted) - _qpos_of(before, task, wanted)).max()
+        return [wanted.of] if apart > QPOS_TOLERANCE else []
+    return [name for name in _moved(before, again, task, wanted.of) if name in others]
 
 
 def _poses_of(starts: Sequence[EpisodeStart], row: int) -> Poses:
