@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS
+from workbench.envs.assets import MissingAssets
 from workbench.live.messages import Load
+from workbench.live.panels.env_options import TITLE
 from workbench.live.worker.reload import load_version
 from workbench.task.description import TaskOptions
 from workbench.task.open import open_task
@@ -39,7 +41,7 @@ def test_a_task_written_for_one_env_gets_advice_to_use_one_env(tmp_path: Path) -
         with pytest.raises(TaskError) as caught:
             several()
         problem = caught.value.problem
-        assert "--num-envs 1" in problem.message
+        assert "--num-envs 1" in problem.message and TITLE in problem.message
         assert (problem.file, problem.code) == (str(file), FOR_ONE.strip())
     open_task(str(file), TaskOptions(1, env_kwargs=KWARGS)).env.close()
 
@@ -52,3 +54,16 @@ def test_a_mistake_that_one_env_does_not_mend_gets_no_such_advice(
     with pytest.raises(TaskError) as caught:
         open_task(str(written(tmp_path, line)), TaskOptions(num_envs, env_kwargs=KWARGS))
     assert "--num-envs" not in caught.value.problem.message
+
+
+def test_a_missing_asset_gets_no_advice_to_open_a_base_class(tmp_path: Path) -> None:
+    file = tmp_path / "base.py"
+    text = (TASKS / "minimal.py").read_text().replace("MinimalEnv(BaseEnv)", "Scene(BaseEnv)")
+    head, registered, rest = text.partition('@register_env("WorkbenchMinimal-v1", max_episode_steps=50)\n')
+    assert registered
+    needs = '@register_env("NeedsAnAsset-v1", max_episode_steps=9, asset_download_ids=["ycb"])\n'
+    file.write_text(f"{head}{rest}\n\n{needs}class Kitchen(Scene):\n    pass\n")
+    with pytest.raises(TaskError) as caught:
+        open_task(str(file), TaskOptions(1, env_kwargs=KWARGS))
+    assert isinstance(caught.value.__cause__, MissingAssets)
+    assert "Scene" not in caught.value.problem.message

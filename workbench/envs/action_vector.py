@@ -218,7 +218,8 @@ def _rows(
         if None in of_robots:
             text += (
                 f", and the control mode {mode} takes {wide}. Choose the policy's own mode with "
-                f"--env control_mode=..., or return {wide} numbers"
+                "--env control_mode=..., or as Control on the page (Run tab, How the envs are made), or return "
+                f"{wide} numbers"
             )
         else:
             robots = ", ".join(f"{robot} {each}" for robot, each in of_robots.items())

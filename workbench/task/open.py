@@ -11,6 +11,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.envs import action_vector as actions
 from workbench.envs.arms import find_arms, without_arms
+from workbench.envs.assets import MissingAssets
 from workbench.envs.backends import BackendUnavailable, find_renderer, keep_render_device, unused_gpu_text
 from workbench.envs.broken_rule import BrokenRule, NeedsOneEnv, class_is_installed, in_brackets, warn_of
 from workbench.envs.camera_data import CameraInfo
@@ -101,13 +102,15 @@ def with_advice(
         if _runs_alone(again, options, tried):
             advice.append(
                 f"the task works with 1 env, from each of {tried} seeds, but not with {options.num_envs}: open it "
-                "with --num-envs 1"
+                "with --num-envs 1, or set Envs to 1 on the page (Run tab, How the envs are made)"
             )
-    if loaded.others and loaded.file is not None and not knows_others:
+    # Another class does not help if an asset is missing, unless it is a task of its own.
+    others = loaded.alternatives if isinstance(error.__cause__, MissingAssets) else loaded.others
+    if others and loaded.file is not None and not knows_others:
         file = loaded.file.name
         advice.append(
-            f"{loaded.chosen} of {file} was tried; the file also has {', '.join(loaded.others)}: name one of "
-            f"these, as in {file}:{loaded.others[-1]}, or choose it as Task on the page"
+            f"{loaded.chosen} of {file} was tried; the file also has {', '.join(others)}: name one of these, as "
+            f"in {file}:{others[-1]}, or choose it as Task on the page (Run tab)"
         )
     if not advice:
         return error
