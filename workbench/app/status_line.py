@@ -8,6 +8,7 @@ from typing import Literal
 
 import viser
 
+from workbench.live.panels.banners import phase_of
 from workbench.live.panels.moment import MomentPart
 from workbench.live.panels.timeline_panel import ago_in_words
 from workbench.live.panels.version_panel import took
@@ -96,7 +97,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "activity": (view.of(SolveView).activity if starting else view.activity)
         if busy is None
-        else _doing(busy),
+        else _doing(busy, phase_of(busy, view)),
         "news": _news(view) if fresh else _pause(view),
         "ago": ago_in_words(view.timeline),
         "can_continue": ContinueFromHere() if view.timeline.can_continue else None,
@@ -159,7 +160,7 @@ def _state(view: SessionView, busy: Busy | None) -> str:
     return view.state if busy.getting_ready else "busy"
 
 
-def _doing(busy: Busy) -> str:
+def _doing(busy: Busy, phase: str) -> str:
     if busy.awaited:
         return f"for a debugger to attach, {busy.seconds:.0f} s; the log has the address"
     if busy.held:
@@ -167,7 +168,7 @@ def _doing(busy: Busy) -> str:
         return f"by a debugger{at} for {busy.seconds:.0f} s; continue in the debugger, not on this page"
     if busy.getting_ready:
         return f"a new worker has been starting for {busy.seconds:.0f} s"
-    return f"{busy.doing} for {busy.seconds:.0f} s"
+    return f"{busy.doing} for {busy.seconds:.0f} s{f': {phase}' if phase else ''}"
 
 
 def _pause(view: SessionView) -> str:

@@ -254,7 +254,7 @@ def _built(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Opened
         with blamed("reset", loaded, task):
             first = task.reset(options.seed)
         clock.lap("reset")
-        on_activity("reading the shapes")
+        on_activity("the task's code has run; the workbench reads the shapes")
         loaded = with_late_imports(loaded)
         description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
         description = replace(

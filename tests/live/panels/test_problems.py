@@ -167,6 +167,14 @@ def test_long_work_can_be_stopped_and_is_shown_instead_of_a_problem(live: Live) 
     assert not busy.seen and "KeyError" in banner(live)
 
 
+def test_a_long_load_is_shown_with_its_phase(live: Live) -> None:
+    phase = "reading <meshes>"
+    for busy, shown in ((Busy(42.0, "loading"), True), (LOOP, False)):
+        live.show(running(2, busy=busy, state="loading", activity=phase))
+        for html in (live.part("Busy").html(), live.html("wb-status")):
+            assert ("reading &lt;meshes&gt;" in html) == shown
+
+
 def test_the_reason_stays_visible_while_a_worker_starts(live: Live) -> None:
     ready = busy_at(21.0, "warming up", "", (), ignores_interrupt=False)
     live.show(failed(busy=ready, state="starting", playing=False))

@@ -254,4 +254,9 @@ def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
             "stops it, and loads the file. Restart ends the process and loads the file as it is now."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
-    return render("busy", subject=subject, busy=busy, advice=advice, link=link)
+    return render("busy", subject=subject, busy=busy, phase=phase_of(busy, view), advice=advice, link=link)
+
+
+def phase_of(busy: Busy, view: SessionView) -> str:
+    """What a long load does now; empty for other work, and inside a hook of the author."""
+    return view.activity if busy.doing == "loading" else ""
