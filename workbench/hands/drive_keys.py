@@ -73,8 +73,7 @@ def driven_action(
     held = [SHARE * ((one.raises in keys) - (one.lowers in keys)) for one in bound]
     both = [key + stick for key, stick in zip_longest(held, sticks[: len(bound)], fillvalue=0.0)]
     amounts = np.clip(np.array(both, float), -1.0, 1.0)
-    axes = [one.name.rpartition("/")[2] for one in bound[:2]]
-    if axes == ["x", "y"]:
+    if is_end_effector(bound):
         ahead, left = amounts[:2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         amounts[:2] = cos * ahead - sin * left, sin * ahead + cos * left
@@ -83,6 +82,11 @@ def driven_action(
         for amount, one in zip(amounts, bound, strict=True)
     ]
     return tuple(one.dimension for one in bound), tuple(map(float, values))
+
+
+def is_end_effector(bound: Sequence[KeyBinding]) -> bool:
+    """Whether the first two numbers move an end effector along x and y, so that the keys follow the view."""
+    return [one.name.rpartition("/")[2] for one in bound[:2]] == ["x", "y"]
 
 
 def _bounds(dimension: ActionDimension) -> tuple[float, float]:

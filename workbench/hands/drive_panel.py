@@ -16,7 +16,7 @@ from workbench.hands.commands import (
     ToggleDriving,
     ToggleReach,
 )
-from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, KeyBinding, bindings, gripper
+from workbench.hands.drive_keys import GRIPPER_KEY, KEYS, KeyBinding, bindings, gripper, is_end_effector
 from workbench.hands.gamepad import GRIPPER_LABEL, LABELS, B, X, Y, pad_amounts, pad_grips
 from workbench.hands.reach import why_no_arm
 from workbench.hands.state import Driven, Hands
@@ -72,11 +72,18 @@ class DrivePanel(PagePart[SessionView]):
             on=reaches,
             off=view.task is None or bool(armless),
         )
-        rows = _rows(bindings(actions), bool(gripper(actions))) if driving else []
+        bound, grips = bindings(actions), gripper(actions)
+        rows = _rows(bound, bool(grips)) if driving else []
         of_set = [tool(name, command) for name, command, _ in SET] if driving else []
         recording = view.of(RecordingStatus)
         self._html.content = tools_html([button, reach], of_set) + render(
-            "drive_keys", rows=rows, note=hands.note, kept=recording.kept, progress=recording.saving.progress
+            "drive_keys",
+            rows=rows,
+            note=hands.note,
+            kept=recording.kept,
+            progress=recording.saving.progress,
+            follows_view=is_end_effector(bound),
+            keyless=len(actions) - len(bound) - len(grips),
         )
 
     def do(self, command: Command, visitor: Visitor) -> None:
