@@ -46,7 +46,7 @@ from workbench.page.command import Command
 from workbench.page.commands import ToggleTimeline
 from workbench.page.widgets.fields import Field, by_name, choice, slider
 from workbench.page.widgets.keys_and_palette import with_key
-from workbench.page.widgets.line_chart import polylines
+from workbench.page.widgets.line_chart import drawn_span, polylines
 from workbench.page.widgets.parts import Clock, PagePart
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import Tool, tool, tools_html
@@ -449,7 +449,7 @@ def _number(value: float) -> str:
 def ago_in_words(past: TimelineView) -> str:
     """Age of the shown moment as text: ``7 steps ago``."""
     # An episode's last step is at the tick of the reset that follows it.
-    return f"{counted(past.steps_ago, 'step')} ago" if past.steps_ago else "before the last reset"
+    return f"{counted(past.steps_ago, 'step')} ago" if past.steps_ago else "before the reset"
 
 
 def step_in_words(view: SessionView) -> str:
@@ -476,9 +476,7 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
     finite = reward[np.isfinite(reward)]
     if not len(finite):
         return []
-    low, high = float(finite.min()), float(finite.max())
-    if low == high:
-        low, high = low - 1.0, high + 1.0
+    low, high = drawn_span(float(finite.min()), float(finite.max()))
     known = np.where(np.isfinite(reward), reward, np.nan)
     if len(known) <= STRIP_POINTS:
         places, values = np.arange(len(known)), known

@@ -20,6 +20,9 @@ MAX_POINTS = 600
 SELECTED_COLOUR = "#228be6"
 MAX_TICKS = 4
 Span = tuple[float, float]
+ROUNDING = 1e-5
+"""Numbers that differ by less than this share of the largest magnitude are drawn as a constant: float32 rounding
+errors would fill the chart."""
 YES_OR_NO: Span = (-0.05, 1.05)
 """Range of a curve of 0 and 1."""
 
@@ -131,9 +134,16 @@ def _value_text(value: float) -> str:
 def _span_of_all(lines: Sequence[ChartLine]) -> Span:
     values = np.concatenate([np.asarray(line.values, np.float64) for line in lines])
     finite = values[np.isfinite(values)]
-    low, high = float(finite.min()), float(finite.max())
-    # A constant is drawn in the middle.
-    return (low, high) if low < high else (low - max(abs(low), 1.0) / 2, low + max(abs(low), 1.0) / 2)
+    return drawn_span(float(finite.min()), float(finite.max()))
+
+
+def drawn_span(low: float, high: float) -> Span:
+    """The range of an axis for finite numbers from `low` to `high`. A constant is in its middle."""
+    most = max(abs(low), abs(high))
+    if high - low > ROUNDING * most:
+        return low, high
+    middle, half = (low + high) / 2, max(most, 1.0) / 2
+    return middle - half, middle + half
 
 
 def _polylines(
