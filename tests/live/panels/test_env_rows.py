@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,6 +79,15 @@ def test_cells_show_the_state_of_an_env() -> None:
     assert (cut.state_word, cut.total) == ("time limit", "")
     assert (after.last, after.last_steps) == ("failed", "9") and after.first_true == ("", "")
     assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
+
+
+def test_what_was_odd_in_both_episodes_is_shown_once() -> None:
+    rows = rows_of()
+    again = rows_of(last=replace(rows.last, outliers={5: rows.outliers[5]}))
+    (flag,) = cells_of(again, np.arange(6))[5].flags
+    assert flag.count(rows.outliers[5][0].text) == 1
+    only_before = rows_of(outliers={}, last=again.last)
+    assert len(cells_of(only_before, np.arange(6))[5].flags) == 1
 
 
 def test_the_moment_of_an_env_is_its_first_outlier_or_its_end() -> None:

@@ -30,7 +30,7 @@ from workbench.machine.text import number_text
 from workbench.page.command import Command, Refused
 from workbench.page.commands import TellUnfolded
 from workbench.page.widgets.fields import choice
-from workbench.page.widgets.line_chart import polylines
+from workbench.page.widgets.line_chart import drawn_span, polylines
 from workbench.page.widgets.paged import Paged
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.visitors import Visitor
@@ -179,11 +179,6 @@ def make_rows(
     for env, curve in zip(envs.tolist(), curves, strict=True):
         state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
         had_one = rows.last.steps[env] >= 0
-        before = [
-            f"{outlier.text} (previous episode, step {outlier.step})"
-            for outlier in rows.last.outliers.get(env, ())
-        ]
-        now = [f"{outlier.text} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
         made.append(
             {
                 "env": env,
@@ -199,10 +194,22 @@ def make_rows(
                 "last_steps": str(int(rows.last.steps[env])),
                 "last_state": last,
                 "tally": f"{counted(int(rows.ended[env]), 'episode')} ended: {ended_text(rows, [env])}",
-                "flags": tuple(now + before),
+                "flags": _flags(rows, env),
             }
         )
     return made
+
+
+def _flags(rows: EnvRows, env: int) -> tuple[str, ...]:
+    """What is odd, each kind once."""
+    before = {outlier.kind: outlier for outlier in rows.last.outliers.get(env, ())}
+    flags = []
+    for outlier in rows.outliers.get(env, ()):
+        earlier = before.pop(outlier.kind, None)
+        also = "" if earlier is None else f"; previous episode, step {earlier.step}"
+        flags.append(f"{outlier.text} (step {outlier.step}{also})")
+    flags += [f"{outlier.text} (previous episode, step {outlier.step})" for outlier in before.values()]
+    return tuple(flags)
 
 
 def ended_text(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> str:
@@ -257,10 +264,11 @@ def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[
     chosen = chosen[:, every]
     if not finite.any():
         return [[] for _ in envs]
-    low, high = chosen[finite].min(), chosen[finite].max()
-    span = high - low if high > low else 1.0
+    low, high = drawn_span(float(chosen[finite].min()), float(chosen[finite].max()))
     x = np.round(np.linspace(0, CURVE_WIDTH, chosen.shape[1]), 1)
-    y = np.round(CURVE_HEIGHT - 1 - (CURVE_HEIGHT - 2) * (np.where(finite, chosen, low) - low) / span, 1)
+    y = np.round(
+        CURVE_HEIGHT - 1 - (CURVE_HEIGHT - 2) * (np.where(finite, chosen, low) - low) / (high - low), 1
+    )
     return [
         polylines([f"{a:g},{b:g}" if there else None for a, b, there in zip(x, heights, ok, strict=True)])
         for heights, ok in zip(y, finite, strict=True)
