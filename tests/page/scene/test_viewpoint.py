@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import viser
 import websockets.sync.client
 from hypothesis import given, settings
@@ -23,6 +24,7 @@ from workbench.page.scene.viewpoint import (
     Framing,
     ViewChoice,
     Viewpoint,
+    frame_all,
     frame_box,
     frame_one,
 )
@@ -48,6 +50,19 @@ def test_the_whole_box_is_in_the_picture(size: tuple[float, float, float], aspec
     assert (corners @ up <= np.tan(FOV_RADIANS / 2) * depth).all()
     assert (corners @ up >= -np.tan(FOV_RADIANS / 2) * depth).all()
     assert (np.abs(corners @ right) <= np.tan(FOV_RADIANS / 2) * aspect * depth).all()
+
+
+@pytest.mark.parametrize("num_envs", [2, 16, 64])
+def test_there_is_room_for_the_labels_under_the_front_envs(num_envs: int) -> None:
+    layout = lay_out(*table_scene(num_envs))
+    viewpoint = frame_all(layout)
+    forward = viewpoint.look_at - viewpoint.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    up = np.cross(right / np.linalg.norm(right), forward)
+    low, high = layout.box_of_all()
+    label = np.array([high[0], (low[1] + high[1]) / 2, layout.floor_height]) - viewpoint.position
+    assert label @ up / (label @ forward) > -0.94 * np.tan(FOV_RADIANS / 2)
 
 
 def test_the_human_camera_s_picture_fits_the_view() -> None:

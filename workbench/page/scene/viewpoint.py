@@ -15,7 +15,7 @@ from workbench.envs.camera_data import Picture
 from workbench.page.door.viser_private import remove_nodes_but
 from workbench.page.scene.bodies import NAMES as BODIES
 from workbench.page.scene.bodies import SceneView
-from workbench.page.scene.env_grid import EnvLayout, box_corners
+from workbench.page.scene.env_grid import MARGIN_METRES, EnvLayout, box_corners
 from workbench.page.scene.software_rendering import InSoftware
 from workbench.page.widgets.parts import Clock
 
@@ -23,6 +23,8 @@ FOV_RADIANS = 0.75
 """Vertical field of view. viser's default of 75 degrees distorts the edges of a grid."""
 DEFAULT_ASPECT = 1.385
 """Aspect ratio (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
+LABEL_SHARE = 0.06
+"""Margin around all envs, as a share of their width."""
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
 """Direction from the scene to the eye: ManiSkill's robots face +x, so the eye is in front of them, slightly
 to the side."""
@@ -65,7 +67,10 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = DEFAULT_ASPECT) -> Vi
 
 
 def frame_all(layout: EnvLayout, aspect: float = DEFAULT_ASPECT) -> Viewpoint:
-    return frame_box(*layout.box_of_all(), aspect)
+    """The view of all envs, with room for their labels, which hang from the front edges."""
+    low, high = layout.box_of_all()
+    margin = np.array([1.0, 1.0, 0.0]) * max(MARGIN_METRES, LABEL_SHARE * float((high - low)[:2].max()))
+    return frame_box(low - margin, high + margin, aspect)
 
 
 def frame_one(
