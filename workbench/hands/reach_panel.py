@@ -89,11 +89,13 @@ class ReachPanel(PagePart[SessionView]):
         if task is None or not reach.shown:
             return
         rows = []
+        one_robot = len({arm.body.rpartition("/")[0] for arm in task.arms}) == 1
         for arm in task.arms:
             key = view.selected_env, arm.body
             answer = reach.reached.get(key)
             text = "drag the handles" if answer is None else reached_text(answer)
-            rows.append((arm.body, text, answer is not None and bool(answer.why)))
+            name = arm.body.rpartition("/")[2] if one_robot else arm.body
+            rows.append((arm.body, name, text, answer is not None and bool(answer.why)))
         self._html.content = render("reach", rows=rows)
 
     # --- the 3-D view --------------------------------------------------------------------------------
