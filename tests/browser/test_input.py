@@ -319,6 +319,7 @@ def test_escape_before_the_palette_has_opened_drops_what_was_typed(small: SmallP
     page.keyboard.type("s")
     page.keyboard.press("Escape")
     page.evaluate(RELEASE_FRAMES_JS)
+    expect(page.locator("body[data-scroll-locked]")).to_have_count(0)  # it has come and gone
     page.keyboard.press("f")
     small.has(FrameScene())
     page.keyboard.press("Control+k")
