@@ -237,6 +237,17 @@ def test_a_driver_sees_the_keys_and_the_set_and_ends_episodes_by_buttons(live_pa
     assert live_page.asked[-3:] == [KeepEpisode(), DiscardEpisode(), BeginAgain()]
 
 
+@pytest.mark.parametrize("count", [7, 9])
+def test_a_driver_sees_how_many_numbers_of_the_action_have_no_key(live_page: Live, count: int) -> None:
+    view = running(2)
+    assert view.task is not None
+    actions = tuple(ActionDimension(f"body/joint{k}", -1.0, 1.0) for k in range(count))
+    task = replace(view.task, actions=actions)
+    live_page.show(replace(view, task=task, features={State: State(driving=True)}))
+    text = words_of(live_page.part("Run").html())
+    assert ("2 numbers" in text) == (count == 9)
+
+
 def test_the_sliders_of_the_action_are_hidden_while_keys_drive(live_page: Live) -> None:
     view = running(2)
     assert view.task is not None

@@ -123,6 +123,17 @@ def test_an_answer_that_repeats_the_last_one_is_drawn(page: Page) -> None:
     assert page.panel.key(seen(led(first))) != page.panel.key(seen(led(second)))
 
 
+@pytest.mark.parametrize(("others", "name"), [((), "hand"), (("second/hand",), ARM)])
+def test_the_panel_names_the_robot_only_where_several_have_arms(
+    page: Page, others: tuple[str, ...], name: str
+) -> None:
+    view = seen(Reach(shown=True))
+    assert view.task is not None
+    arms = tuple(ArmDescription(body, ("a", "b", "c")) for body in (ARM, *others))
+    page.panel.draw(replace(view, task=replace(view.task, arms=arms)))
+    assert f'title="{ARM}">{name}</td>' in page.panels.html()
+
+
 def test_a_target_out_of_reach_is_red_and_says_what_is_left(page: Page) -> None:
     page.show(led(Reached(1, ARM, "follow", 0.0, 0.0, "")), playing=True)
     (mark,) = page.panels.nodes("/hands/reach/0_target")
