@@ -23,39 +23,22 @@ def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
         assert not errors
 
 
-def choose(desk: Desk, label: str, option: str, of: str = "") -> None:
-    desk.page.locator(f"select[name*='{of or label}']").select_option(label=option)
-
-
-def select(desk: Desk, body: str) -> None:
-    desk.tab("Inspect")
-    choose(desk, "Show", "bodies", of="choose_inspected")
-    desk.page.get_by_text(body, exact=True).first.click()
-    expect(desk.page.locator(".wb-body b").first).to_have_text(body)
-
-
-def position(desk: Desk) -> list[float]:
-    """Position of the selected body, in metres."""
-    first = desk.page.locator(".wb-body .wb-num").first.inner_text().splitlines()[0]
-    return [float(value) for value in first.removeprefix("p ").split(",")]
-
-
 def test_held_keys_drive_the_hand_and_stop_gives_back(desk: Desk) -> None:
     desk.tab("Run")
-    choose(desk, "Control", "pd_ee_delta_pose", of="use_control_mode")
+    desk.choose("use_control_mode", "pd_ee_delta_pose")
     expect(desk.page.locator(".wb-status")).to_contain_text("pd_ee_delta_pose")
-    select(desk, "panda/panda_hand")
-    before = position(desk)
+    desk.select_body("panda/panda_hand")
+    before = desk.body_position()
     desk.press("k")
     sign = desk.page.locator(".wb-drives")
     expect(sign).to_be_visible()
     desk.page.keyboard.down("e")
-    until(lambda: position(desk)[2] > before[2] + 0.03, "the hand to rise")
+    until(lambda: desk.body_position()[2] > before[2] + 0.03, "the hand to rise")
     desk.page.keyboard.up("e")
     desk.page.wait_for_timeout(700)
-    height = position(desk)[2]
+    height = desk.body_position()[2]
     desk.page.wait_for_timeout(700)
-    assert position(desk)[2] == pytest.approx(height, abs=0.005), "a released key holds still"
+    assert desk.body_position()[2] == pytest.approx(height, abs=0.005), "a released key holds still"
     sign.get_by_role("button", name="stop").click()
     expect(sign).to_be_hidden()
     desk.button("Pause").click()
@@ -92,21 +75,21 @@ navigator.getGamepads = () => [null, window.pad];
 def test_a_gamepad_moves_the_hand_only_while_a_person_drives(desk: Desk) -> None:
     page = desk.page
     desk.tab("Run")
-    choose(desk, "Source", "hold still", of="choose_actions")
-    select(desk, "panda/panda_hand")
+    desk.choose("choose_actions", "hold still")
+    desk.select_body("panda/panda_hand")
     page.wait_for_timeout(1000)
-    before = position(desk)[2]
+    before = desk.body_position()[2]
     page.evaluate(PAD)
     page.evaluate("pad.axes[3] = -1")
     page.wait_for_timeout(1000)
-    assert position(desk)[2] == pytest.approx(before, abs=0.005), "nobody drives"
+    assert desk.body_position()[2] == pytest.approx(before, abs=0.005), "nobody drives"
     desk.press("k")
-    until(lambda: position(desk)[2] > before + 0.03, "the hand to rise")
+    until(lambda: desk.body_position()[2] > before + 0.03, "the hand to rise")
     page.evaluate("pad.axes[3] = 0")
     page.wait_for_timeout(1000)
-    height = position(desk)[2]
+    height = desk.body_position()[2]
     page.wait_for_timeout(700)
-    assert position(desk)[2] == pytest.approx(height, abs=0.005), "a released stick holds still"
+    assert desk.body_position()[2] == pytest.approx(height, abs=0.005), "a released stick holds still"
     desk.tab("Run")
     expect(page.get_by_text("gamepad connected")).to_be_visible()
     page.evaluate("pad.buttons[2].value = 1")

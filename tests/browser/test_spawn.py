@@ -31,9 +31,7 @@ def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
 
 def test_a_dragged_side_is_written_to_the_file_checked_and_reverted(desk: Desk) -> None:
     page, text = desk.page, desk.file.read_text()
-    desk.tab("Inspect")
-    page.locator("select[name*='choose_inspected']").select_option(label="bodies")
-    page.get_by_text("cube", exact=True).first.click()
+    desk.select_body("cube")
     press(page, "Spawn range")
     expect(page.get_by_text("y from, to", exact=True)).to_be_visible(timeout=120_000)
     until(lambda: numbers(page, "y from, to") == [-0.1, 0.1], "the range in the file")

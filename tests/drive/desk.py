@@ -69,6 +69,23 @@ class Desk:
         found = re.search(r"history: (\d+) steps?,", self.page.locator(".wb-legend-row").inner_text())
         return 0 if found is None else int(found[1])
 
+    def choose(self, field: str, option: str) -> None:
+        """Choose an option of the field whose command is `field`."""
+        self.page.locator(f"select[name*='{field}']").select_option(label=option)
+
+    def select_body(self, body: str) -> None:
+        """Select a body on the Inspect tab."""
+        self.tab("Inspect")
+        self.choose("choose_inspected", "bodies")
+        self.page.get_by_text(body, exact=True).filter(visible=True).first.click()
+        expect(self.page.locator(".wb-body b").first).to_have_text(body)
+        self.leave_inputs()
+
+    def body_position(self) -> list[float]:
+        """(3,) position of the selected body in the env's frame, metres, as the Inspect tab shows it."""
+        first = self.page.locator(".wb-body .wb-num").first.inner_text().splitlines()[0]
+        return [float(value) for value in first.removeprefix("p ").split(",")]
+
     def box(self, what: str) -> FloatRect:
         """Bounding box of the last element that the selector `what` finds, in page pixels."""
         place = self.page.locator(what).last

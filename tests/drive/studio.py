@@ -58,12 +58,17 @@ def view(page: Page) -> NDArray[np.int64]:
 
 def end_of_the_left_arrow(page: Page) -> tuple[float, float] | None:
     """The world's y axis points right in the view: the rightmost pixel with the green of the gizmo's arrow."""
+    return end_of_green(page, 1)
+
+
+def end_of_green(page: Page, side: int) -> tuple[float, float] | None:
+    """The end of a gizmo's arrow along its y axis, which points right (`side` 1) or left (-1) in the view."""
     r, g, b = np.moveaxis(view(page), -1, 0)
     ys, xs = np.nonzero((g > 180) & (g - r > 50) & (g - b > 30))
     if not len(xs):
         return None
-    tip = xs.argmax()
-    return float(xs[tip] - 6 + VIEW["x"]), float(ys[tip] + VIEW["y"])
+    tip = (side * xs).argmax()
+    return float(xs[tip] - 6 * side + VIEW["x"]), float(ys[tip] + VIEW["y"])
 
 
 def picture(page: Page) -> str:
