@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, jump, live_session, wait_until
+from tests.drive.session import TASKS, jump, live_session, runs, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import RevertStartChange, SaveStartChange, SetJoint, WriteQpos
 from workbench.hands.qpos_source import find_qpos, plan_qpos, without_noise
@@ -61,6 +61,19 @@ def test_a_keyframe_to_which_a_reset_adds_noise_is_written_checked_and_reverted(
         session, lambda v: v.of(StartEdit).stage == "undone" and not v.of(StartEdit).writing, "the old text"
     )
     assert file.read_text() == text
+
+
+def test_noise_that_the_seed_does_not_decide_is_noted(session: Session, file: Path) -> None:
+    text = file.read_text()
+    unseeded = text.replace("torch.rand((b, 3)) *", "torch.as_tensor(np.random.rand(b, 3)).float() *")
+    file.write_text(unseeded)
+    runs(session, unseeded)
+    jump(session, lambda: session.do(SetJoint(ROBOT, 0, 28.6478898)))
+    session.do(WriteQpos(ROBOT))
+    planned = edit(session, "planned", "refused")
+    assert planned.edit is not None, planned.message
+    assert any(ROBOT in note for note in planned.edit.notes)
+    file.write_text(text)
 
 
 def test_only_the_positions_that_change_are_replaced() -> None:
