@@ -46,7 +46,7 @@ LIST = WRITTEN["a list, positional to the end"]
 WHY_NOT = {
     "edit": "smaller than the precision|is given by [*] or",
     "add": "2 returns",
-    "duplicate": "is in no list or dict",
+    "duplicate": "not in a list or dict",
     "rename": "$.",
     "remove": "by hand",
 }
