@@ -637,8 +637,9 @@
       padBeat ||= setInterval(readPad, PAD_BEAT);
     },
     seen(element) {
-      new IntersectionObserver(([{ isIntersecting }], observer) => {
-        if (!isIntersecting) return;
+      new IntersectionObserver((changes, observer) => {
+        // A busy browser reports several changes at once, the oldest first: out of sight, then in sight.
+        if (!changes.some(({ isIntersecting }) => isIntersecting)) return;
         observer.disconnect();
         send(JSON.parse(element.dataset.seen));
       }).observe(element);
