@@ -47,6 +47,8 @@ def test_held_keys_drive_the_hand_and_stop_gives_back(desk: Desk) -> None:
 def test_a_dragged_slider_sets_its_joint_once_and_undo_takes_it_back(desk: Desk) -> None:
     desk.tab("Run")
     page = desk.page
+    # Until then joints move, also after the press on Pause.
+    expect(page.locator(".wb-status")).to_contain_text("paused")
     page.locator("[data-fold='Joints']").click()
     slider = page.locator("input[type=range][name$='panda.0']")
     number = page.locator("input[type=text][name$='panda.0']")
