@@ -31,7 +31,7 @@ def test_planning_rules_are_off_by_default() -> None:
     ("name", "state", "why"),
     [
         ("different_objects", "not_known", "different in each env"),
-        ("minimal", "not_applicable", "no reward"),
+        ("minimal", "not_applicable", "maximises the reward"),
     ],
 )
 def test_a_task_that_cannot_be_planned_is_not_judged_with_the_reason(name: str, state: str, why: str) -> None:
