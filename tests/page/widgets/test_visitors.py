@@ -135,7 +135,7 @@ def test_a_failing_command_affects_nothing_else_and_its_page_is_told(
     house: House, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr(Visitor, "tell", lambda visitor, *words: told.append(visitor.name))
+    monkeypatch.setattr(Visitor, "notify", lambda visitor, *words: told.append(visitor.name))
     with house.open(house.names()[0]) as channel:
         say(channel, 1, "toggle_play")
         say(channel, 2, "step")
