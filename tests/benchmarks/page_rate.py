@@ -43,7 +43,7 @@ import tyro
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.drive.page import launch, new_page, open_workbench
+from tests.drive.page import launch, new_page, open_workbench, with_empty_settings
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
@@ -294,6 +294,7 @@ def main(options: Options) -> None:
     chromium = find_chromium()
     if chromium is None:
         sys.exit(how_to_get_chromium())
+    with_empty_settings()
     drawing = {
         "none": "nothing is drawn",
         "page": "draw calls do nothing",

@@ -30,7 +30,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
 from tests.benchmarks.table import Row, keep
-from tests.drive.page import launch, new_page, open_workbench
+from tests.drive.page import launch, new_page, open_workbench, with_empty_settings
 from tests.drive.processes import workers_of
 from tests.live.hazards import calm, provocation, provoke, write_task
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
@@ -189,6 +189,7 @@ def main(options: Options) -> None:
     chromium = find_chromium()
     if chromium is None:
         sys.exit(how_to_get_chromium())
+    with_empty_settings()
     with tempfile.TemporaryDirectory() as name:
         file = write_task(Path(name))
         arguments = (str(file), "--num-envs", str(options.num_envs), "--memory-limit", "3GB")

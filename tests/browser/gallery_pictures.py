@@ -19,8 +19,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.take_screenshots import POLICY, Desk, picture_of, with_empty_settings
-from tests.drive.page import browser_at, close_notice, new_page, open_workbench
+from tests.browser.take_screenshots import POLICY, Desk, picture_of
+from tests.drive.page import browser_at, close_notice, new_page, open_workbench, with_empty_settings
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]

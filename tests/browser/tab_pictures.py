@@ -29,7 +29,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.drive.page import close_notice, launch, new_page, open_workbench
+from tests.drive.page import close_notice, launch, new_page, open_workbench, with_empty_settings
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -197,6 +197,7 @@ def side_by_side(
 
 
 def main() -> None:
+    with_empty_settings()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

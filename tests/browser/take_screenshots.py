@@ -6,7 +6,6 @@ and the animated ``demo.webp`` (`film.py`). Names select from `SHOTS`; without a
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -28,7 +27,7 @@ from tests.browser.film import take_film
 from tests.browser.tutorial_pictures import take_steps, text_after
 from tests.docs.commands import commands
 from tests.docs.walk import FILE, STEPS, after
-from tests.drive.page import browser_at, close_notice, new_page, open_workbench
+from tests.drive.page import browser_at, close_notice, new_page, open_workbench, with_empty_settings
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]
@@ -471,12 +470,6 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "tutorial": shoot_tutorial,
 }
 """``page`` also takes run, cameras and banner, ``review`` also library and compare, ``tutorial`` all of the tutorial."""
-
-
-def with_empty_settings() -> None:
-    """Use empty settings: the user's trusted files and recent tasks are neither shown nor changed."""
-    for folder in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):
-        os.environ[folder] = tempfile.mkdtemp(prefix="workbench-pictures-")
 
 
 def main(names: list[str]) -> None:

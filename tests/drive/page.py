@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -111,6 +112,12 @@ def seen_at_failure(failed: bool) -> list[Sight]:
         return []
     shown = [_sight_of(page, errors) for page, errors in _pages]
     return [*closed, *shown, *(Sight("\n".join(opened.lines)) for opened in _commands)]
+
+
+def with_empty_settings() -> None:
+    """Use empty settings, for scripts: the user's trusted files, recent tasks and choices are neither shown nor changed."""
+    for folder in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):
+        os.environ[folder] = tempfile.mkdtemp(prefix="workbench-script-")
 
 
 def _sight_of(page: Page, errors: list[str]) -> Sight:

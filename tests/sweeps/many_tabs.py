@@ -24,7 +24,7 @@ from playwright.sync_api import Page, sync_playwright
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import COUNT, TASK, play_to_pause, prepare, timed_click
 from tests.benchmarks.page_rate import Options as PageOptions
-from tests.drive.page import launch, new_page, open_workbench
+from tests.drive.page import launch, new_page, open_workbench, with_empty_settings
 from tests.drive.tabs import Tab, open_deaf_tab, tabs_of
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
@@ -77,6 +77,7 @@ def main(options: Options) -> None:
     chromium = find_chromium()
     if chromium is None:
         sys.exit(how_to_get_chromium())
+    with_empty_settings()
     with tempfile.TemporaryDirectory() as name:
         file = Path(shutil.copy(TASK, Path(name) / "push_cube.py"))
         with (
