@@ -48,7 +48,7 @@ MAX_PARTS = 12
 
 
 @dataclass(frozen=True)
-class Histogram:
+class PoseHistogram:
     """Distribution of a coordinate over the resets."""
 
     name: str
@@ -248,8 +248,8 @@ def spread_text(cloud: ResetCloud, row: int) -> str:
     return f"{count} resets{more}. Click a point to show its reset."
 
 
-def histograms(cloud: ResetCloud, row: int, body: str) -> list[Histogram]:
-    """Of x, y, z and the rotation about z; empty before the first reset."""
+def histograms(cloud: ResetCloud, row: int, body: str) -> list[PoseHistogram]:
+    """The histograms of x, y, z and the rotation about z; empty before the first reset."""
     poses, marked = cloud.of(row).reshape(-1, 7).astype(np.float64), marks(cloud, row, body).reshape(-1)
     there = np.isfinite(poses).all(axis=1)
     poses, marked = poses[there], marked[there]
@@ -260,17 +260,17 @@ def histograms(cloud: ResetCloud, row: int, body: str) -> list[Histogram]:
     return [_histogram(name, one, marked) for name, one in values.items()]
 
 
-def _histogram(name: str, values: Floats, marked: NDArray[np.int8]) -> Histogram:
+def _histogram(name: str, values: Floats, marked: NDArray[np.int8]) -> PoseHistogram:
     low, high = float(values.min()), float(values.max())
     written = (lambda value: f"{value:.0f}°") if name == "yaw" else (lambda value: f"{value:.3f} m")
     if high - low < SAME:
-        return Histogram(name, written(low), "", ())
+        return PoseHistogram(name, written(low), "", ())
     counts = np.stack(
         [np.histogram(values[marked == mark], BINS, (low, high))[0] for mark in (FINE, OVERLAPS, BEYOND)], 1
     )
     heights = 100 * counts / counts.sum(axis=1).max()
     bars = tuple((float(a), float(b), float(c)) for a, b, c in heights)
-    return Histogram(name, written(low), written(high), bars)
+    return PoseHistogram(name, written(low), written(high), bars)
 
 
 def trouble_rows(cloud: ResetCloud, row: int, body: str) -> list[ResetsRow]:

@@ -60,7 +60,7 @@ class StartJobs:
         self._process, self._happen = process, happen
         self._asked: PlanStart | CheckStart | None = None
         self._jobs = Jobs(lambda: None, self._failed)
-        self._aside = BlockingPool("pose-edits")
+        self._aside = BlockingPool("start-edits")
 
     def perform(self, effect: StartEffect) -> None:
         match effect:
