@@ -61,6 +61,7 @@ class JobResult:
         self._html = gui.add_html("", visible=False)
         self._began: float | None = None
         self._new = NewResult()
+        self._result: object = None
         self._drawn: object = None
 
     def asked(self, now: object) -> None:
@@ -80,8 +81,8 @@ class JobResult:
         """
         self._draw_bar(running)
         new = self._new.just_came(result)
-        if (wanted := (id(result), other, new)) != self._drawn:
-            self._drawn = wanted
+        if result is not self._result or (other, new) != self._drawn:
+            self._result, self._drawn = result, (other, new)
             self._html.visible = bool(result)
             if result:
                 self._html.content = html(new)

@@ -220,7 +220,7 @@ class CameraReportPanel(PagePart[SessionView]):
         sheet = results.sheet
         mine = camera is not None and bool(sheet) and sheet[0].key == camera.key
         report = None if camera is None else results.report_over_envs(camera.key)
-        other = id(report), env
+        other = report, env
         self._pictures.draw(
             view.of(StudioView).progress,
             sheet if mine else None,

@@ -151,7 +151,7 @@ class DepthReport:
         return None if farthest is None else _rounded(-farthest * 1.5, up=True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraReport:
     """What one camera, or a placement that does not exist yet, sees in E envs."""
 

@@ -68,7 +68,7 @@ class Visual:
     """(K,) body index of each instance."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SceneGeometry:
     """Everything about a scene that does not change from frame to frame.
 

@@ -95,7 +95,7 @@ class BodyMark:
     ) -> None:
         self._edges = line_set(server, f"{name}/box", colour, 2.5)
         self._label = view_label(server, f"{name}/label", "bottom-left")
-        self._box_of: tuple[int, int, int] | None = None
+        self._box_of: tuple[SceneGeometry, int, int] | None = None
         self._box: NDArray[np.float32] | None = None
 
     def draw(
@@ -109,7 +109,7 @@ class BodyMark:
         """
         body = geometry.body_names.index(name) if name in geometry.body_names else -1
         pose = poses[env, body].astype(np.float64)
-        if (of := (id(geometry), env, body)) != self._box_of:
+        if (of := (geometry, env, body)) != self._box_of:
             self._box_of, self._box = of, None if body < 0 else box_of_body(geometry, env, body)
         if body < 0 or self._box is None or not np.isfinite(pose).all():
             self.clear()

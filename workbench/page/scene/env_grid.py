@@ -28,7 +28,7 @@ ACTING_MARGIN_METRES = np.float32(0.08)
 """Margin around the frames of links and bodies."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnvLayout:
     """The bounding box of one env and the offset of each env, in metres, z up.
 
@@ -238,7 +238,7 @@ class SelectionMark:
     def __init__(self, server: viser.ViserServer) -> None:
         self._frame = line_set(server, "/selected/frame", COLOUR, 3.0)
         self._label = view_label(server, "/selected/label", "top-center")
-        self._drawn: tuple[int, int, str] | None = None
+        self._drawn: tuple[EnvLayout, int, str] | None = None
 
     def draw(self, layout: EnvLayout, env: int, shown: bool, name: str | None = None) -> None:
         """Mark this env and label it with `name`, by default its number. Without `shown` (the env is alone in
@@ -247,7 +247,7 @@ class SelectionMark:
         if not shown:
             self.clear()
             return
-        wanted = (id(layout), env, name)
+        wanted = (layout, env, name)
         if wanted == self._drawn:
             return
         self._drawn = wanted
