@@ -158,3 +158,10 @@ def test_a_requested_recording_is_opened_even_if_it_is_not_the_newest(
         tabs.open()
         opened = until(lambda: review.view().opened, "an open recording", seen=lambda: review.view().problems)
     assert [one.episode.info.seed for one in opened] == [3]
+
+
+def test_a_page_requested_after_the_end_is_not_waited_for(app: App) -> None:
+    """Otherwise a task that is being opened as the program ends would delay its end."""
+    app.shared.pages.start("live")
+    app.shared.pages.stop()
+    assert app.shared.pages.show("review").cancelled()

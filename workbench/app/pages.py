@@ -7,6 +7,7 @@ import queue
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -99,7 +100,7 @@ class Pages:
     ) -> None:
         self._server, self._stage, self._make = server, stage, make
         self._requests: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
-        self._ending = False
+        self._ending = self._stopped = False
         self.shown: Which | None = None
         """Name of the page that is shown; None while a page is being built."""
         self._page: ShownPage | None = None
@@ -114,14 +115,23 @@ class Pages:
         shown.result()
 
     def show(self, which: Which, rebuild: bool = False) -> Future[None]:
-        """Request a page. The future is done when this page, or one that was requested later, is shown.
+        """Request a page. The future is done when this page, or one that was requested later, is shown; it is
+        cancelled if drawing stops first.
 
         Args:
             rebuild: build the page again even if it is shown, because its session was replaced.
         """
         request = _PageRequest(which, rebuild)
         self._requests.put(request)
+        if self._stopped:
+            self._cancel_requests()
         return request.shown
+
+    def _cancel_requests(self) -> None:
+        """Cancel requests that no thread will answer: the end of the program would wait for them."""
+        with suppress(queue.Empty):
+            while True:
+                self._requests.get_nowait().shown.cancel()
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Let the page that is shown carry out a command."""
@@ -135,6 +145,8 @@ class Pages:
         self._ending = True
         if self._thread.ident is not None:
             self._thread.join(_BUILD_TIMEOUT_SECONDS)
+        self._stopped = True
+        self._cancel_requests()
         if self._page is not None:
             self._page.close()
 
