@@ -22,11 +22,19 @@ from workbench.task.load import load_task, undo_load
 EXAMPLE = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 Edits = tuple[tuple[str, str], ...]
 Checked = Callable[..., RuleResult]
+CheckedRules = Callable[..., dict[str, RuleResult]]
 
 
 @pytest.fixture
-def checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
-    """A function ``checked(rule, (old, new), ..., text=..., num_envs=4, seeds=8, **env_kwargs)`` that returns the rule's result.
+def checked(checked_rules: CheckedRules) -> Checked:
+    """The same as `checked_rules` for one rule; returns its result."""
+    return lambda rule, *edits, **more: checked_rules([rule], *edits, **more)[rule]
+
+
+@pytest.fixture
+def checked_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CheckedRules:
+    """A function ``checked_rules(rules, (old, new), ..., text=..., num_envs=4, seeds=8, **env_kwargs)`` that returns the
+    result of each rule.
 
     Each `old` must be in the text, which is the example's by default.
     """
@@ -37,13 +45,13 @@ def checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
             monkeypatch.delitem(known, env_id, raising=False)
 
     def check(
-        rule: str,
+        rules: Collection[str],
         *edits: tuple[str, str],
         text: str | None = None,
         num_envs: int = 4,
         seeds: int = 8,
         **env_kwargs: Any,
-    ) -> RuleResult:
+    ) -> dict[str, RuleResult]:
         file = tmp_path / "task.py"
         content = EXAMPLE.read_text() if text is None else text
         for old, new in edits:
@@ -51,7 +59,7 @@ def checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
             content = content.replace(old, new)
         file.write_text(content)
         linecache.checkcache(str(file))
-        return check_rule(rule, str(file), num_envs=num_envs, seeds=seeds, **env_kwargs)
+        return check_rules(rules, str(file), num_envs=num_envs, seeds=seeds, **env_kwargs)
 
     return check
 

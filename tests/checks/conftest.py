@@ -1,5 +1,5 @@
-"""The shared fixture for tests of rules."""
+"""The shared fixtures for tests of rules."""
 
-from tests.checks.checked import checked
+from tests.checks.checked import checked, checked_rules
 
-__all__ = ["checked"]
+__all__ = ["checked", "checked_rules"]

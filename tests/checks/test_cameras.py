@@ -13,6 +13,7 @@ HUMAN_EYE = "pose = sapien_utils.look_at(eye=[0.7, 0.7, 0.6], target=[0.0, 0.0, 
 CAMERA = '[CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_past_the_objects(checked: Checked, renderer: None) -> None:
     away = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[1.5, 0, 0])"
     result = checked("camera-sees", (EYE, away))

@@ -146,11 +146,12 @@ def test_a_drawing_that_grows_too_large_ends_with_a_text_at_its_place() -> None:
 
 def test_new_names_at_every_step_end_with_a_text() -> None:
     tracks, _ = recorded(
-        1000, lambda state: {f"{name} {'x' * 300}": drawing("points", 1.0) for name in range(state)}
+        MAX_DRAWINGS + 50,
+        lambda state: {f"{name} {'x' * 300}": drawing("points", 1.0) for name in range(state)},
     )
     assert len(tracks) == MAX_DRAWINGS + 1
     (message,) = [track for track in tracks.values() if track.kind == "text"]
-    assert message.states.tolist() == [MAX_DRAWINGS + 1] and message.at(999)
+    assert message.states.tolist() == [MAX_DRAWINGS + 1] and message.at(MAX_DRAWINGS + 49)
 
 
 def test_a_description_with_too_many_or_unknown_drawings_is_refused(
