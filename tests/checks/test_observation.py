@@ -33,6 +33,15 @@ def test_an_observation_that_never_changes(checked: Checked) -> None:
     assert "'extra/size'" in finding.message and "0.02" in finding.message
 
 
+def test_the_line_of_a_finding_writes_the_entry_and_does_not_only_read_it(checked: Checked) -> None:
+    write = 'obs["size"] = torch.full((self.num_envs, 1), CUBE_HALF_SIZE)'
+    edit = (
+        "        return obs\n",
+        f'        if info.get("size") is None:\n            {write}\n        return obs\n',
+    )
+    assert the_finding(checked("observation-constant", edit)).code == write
+
+
 def test_an_observation_in_millimetres(checked: Checked) -> None:
     finding = the_finding(checked("observation-huge", (GOAL, '"goal_pos": self.goal.pose.p * 1e6,')))
     assert "'extra/goal_pos'" in finding.message and finding.code.startswith('"goal_pos"')

@@ -160,13 +160,13 @@ class Places:
         )
 
     def entry(self, name: str, hook: str = "evaluate") -> Place | None:
-        """The line, in a hook, that has this entry as a key or a keyword; else the hook's ``def`` line."""
-        for module, function in self.functions(hook):
-            for node in ast.walk(function):
-                if isinstance(node, ast.Constant) and node.value == name:
-                    return module.place(node, hook)
-                if isinstance(node, ast.keyword) and node.arg == name:
-                    return module.place(node.value, hook)
+        """The line, in a hook, that writes this entry; else a line that mentions it; else the hook's ``def`` line."""
+        for lines_of in (_written_entries, _mentioned_entries):
+            for module, function in self.functions(hook):
+                for node in ast.walk(function):
+                    for entry, at in lines_of(node):
+                        if entry == name:
+                            return module.place(at, hook)
         return self.hook(hook)
 
     def body(self, name: str, *hooks: str) -> Place | None:
@@ -206,6 +206,22 @@ class Places:
                 for target in node.targets:
                     if named and isinstance(target, ast.Attribute):
                         yield target.attr
+
+
+def _written_entries(node: ast.AST) -> Iterator[tuple[object, ast.expr]]:
+    """Keys that the node writes into a dict, each with the place of its key: ``{"a": 1}``, ``dict(a=1)``,
+    ``info["a"] = 1``."""
+    if isinstance(node, ast.Dict):
+        yield from ((key.value, key) for key in node.keys if isinstance(key, ast.Constant))
+    elif isinstance(node, ast.keyword):
+        yield node.arg, node.value
+    elif isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store):
+        yield from _mentioned_entries(node.slice)
+
+
+def _mentioned_entries(node: ast.AST) -> Iterator[tuple[object, ast.expr]]:
+    if isinstance(node, ast.Constant):
+        yield node.value, node
 
 
 def _places(node: ast.AST, attributes: set[str]) -> bool:
