@@ -73,7 +73,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     for leaf, bodies in bodies_of.items():
         yield Found(
             f"In obs_mode {checkup.pictured.env.obs_mode!r}, which has pictures, {leaf!r} of _get_obs_extra() depends "
-            f"on the pose of {listed(bodies)}. Add the entry only `if self.obs_mode_struct.use_state:`.",
+            f"on the state of {listed(bodies)}. Add the entry only `if self.obs_mode_struct.use_state:`.",
             place_of_leaf(checkup, f"extra/{leaf}"),
         )
     if not bodies_of:
