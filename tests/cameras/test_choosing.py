@@ -71,7 +71,7 @@ def test_the_frustum_is_hidden_while_a_page_looks_from_the_cameras_place(live_pa
     live_page.show(view)
     assert [node.name for node in live_page.nodes("/cameras/")] == ["/cameras/sensor base_camera"]
     address, arguments = handshake(f"http://127.0.0.1:{live_page.server.get_port()}")
-    with websockets.sync.client.connect(address, **arguments) as page:
+    with websockets.sync.client.connect(address, close_timeout=0.1, **arguments) as page:
         for height, seen in ((3.05, False), (3.5, True)):
             page.send(camera_message((1.0, 2.0, height)))
             until(

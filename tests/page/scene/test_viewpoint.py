@@ -99,7 +99,7 @@ def test_a_page_is_reframed_on_resize_until_the_user_moves_the_view(
 
     framing.frame(frame)
     address, arguments = handshake(f"http://127.0.0.1:{server.get_port()}")
-    with websockets.sync.client.connect(address, **arguments) as page:
+    with websockets.sync.client.connect(address, close_timeout=0.1, **arguments) as page:
 
         def shows(width: int, position: np.ndarray) -> np.ndarray:
             """The camera position after the page reported this width."""
