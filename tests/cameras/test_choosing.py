@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import websockets.sync.client
@@ -11,7 +12,14 @@ from tests.drive.live import Live
 from tests.drive.scenes import camera, running
 from tests.drive.tabs import camera_message, handshake
 from tests.drive.waiting import until
-from workbench.cameras.commands import ChooseAxes, ChooseCamera, ChooseHandles, MoveCameraToView
+from workbench.cameras.commands import (
+    ChooseAxes,
+    ChooseCamera,
+    ChooseHandles,
+    ChooseSnap,
+    MoveCameraToView,
+    ShowModality,
+)
 from workbench.cameras.events import CameraChosen
 from workbench.cameras.studio_panel import NO_CAMERA, TAB
 from workbench.cameras.view import StudioCamera, StudioView
@@ -44,6 +52,46 @@ def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
     assert live_page.client.notices == ["There is no camera gone · sensor."]
     live_page.do(MoveCameraToView())
     assert live_page.client.notices[1:] == ["First choose a camera that can be placed."]
+
+
+def test_undo_redo_and_reset_are_offered_when_there_is_something_to_do(live_page: Live) -> None:
+    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+    info = replace(camera("base_camera"), settings=at)
+    tab = live_page.part(TAB)
+
+    def offered(moved: bool = False, **changes: Any) -> dict[str, bool]:
+        one = StudioCamera(info.key, info, replace(at, width=80) if moved else at, moved, None)
+        live_page.show(running(1, studio=StudioView(cameras=(one,), selected=info.key, **changes)))
+        buttons = {one.text.strip(): one for one in tab.buttons()}
+        return {name: buttons[name].command is not None for name in ("Undo", "Redo", "Reset to file")}
+
+    assert offered() == {"Undo": False, "Redo": False, "Reset to file": False}
+    assert offered(undo="moved it") == {"Undo": True, "Redo": False, "Reset to file": False}
+    assert "moved it" in tab.button("Undo").hint
+    assert offered(redo="turned it") == {"Undo": False, "Redo": True, "Reset to file": False}
+    assert "turned it" in tab.button("Redo").hint
+    assert offered(moved=True) == {"Undo": False, "Redo": False, "Reset to file": True}
+    assert "40 × 3" not in tab.html()
+    offered(moved=True, preview_scale=0.5)
+    assert "40 × 3" in tab.html()
+
+
+def test_the_buttons_show_what_is_chosen(live_page: Live) -> None:
+    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+    info = replace(camera("base_camera"), settings=at)
+    tab = live_page.part(TAB)
+
+    def on(scale: float = 1.0) -> set[str]:
+        one = StudioCamera(info.key, info, at, False, None)
+        live_page.show(running(1, studio=StudioView(cameras=(one,), selected=info.key, preview_scale=scale)))
+        return {one.text.strip() for one in tab.buttons() if one.pressed}
+
+    assert on() == {"rgb", "pose", "world", "none", "full"}
+    for command in (ShowModality(kind="depth"), ChooseAxes(own=True), ChooseSnap(snap="1 cm, 5°")):
+        live_page.do(command)
+    assert on(0.5) == {"depth", "pose", "camera", "1 cm, 5°", "½"}
+    live_page.do(ChooseSnap(snap="2 cm"))
+    assert "2 cm" in live_page.client.notices.pop() and "1 cm, 5°" in on()
 
 
 def test_axes_are_offered_for_the_handles_of_the_pose_only(live_page: Live) -> None:

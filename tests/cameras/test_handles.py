@@ -211,6 +211,14 @@ def test_a_dragged_camera_follows_the_handle_in_one_step_of_undo(page: Page, own
     (second,) = page.placed()
     assert_stands(second.settings, [*(pose[:3] + [0.0, 0.0, 0.3]), *pose[3:]], mount)
     assert second.control != first.control, "another drag is another step of undo"
+    page.begin("camera")  # its release does not arrive
+    page.begin("camera")
+    page.move("camera", pose[:3] + [0.1, 0.0, 0.0], pose[3:] if own else UNTURNED)
+    page.begin("camera")
+    page.move("camera", pose[:3] + [0.2, 0.0, 0.0], pose[3:] if own else UNTURNED)
+    page.release("camera")
+    third, fourth = page.placed()
+    assert third.control != fourth.control
 
 
 def now(page: Page) -> CameraSettings:
@@ -238,6 +246,14 @@ def test_a_snapped_drag_ends_on_the_grid_of_the_env_or_on_steps_of_the_camera(pa
     step = relative_to(pose_of(FILE), pose_of(placed.settings))
     np.testing.assert_allclose(step[:3], [0.05, 0.0, 0.1], atol=1e-6)
     assert placed.settings.quaternion == FILE.quaternion
+    page.live.do(ChooseHandles(look_at=True))
+    page.live.show(chosen())
+    target = target_of(FILE) + OFFSET
+    page.begin("target")
+    page.move("target", target + [0.07, 0.0, 0.0])
+    page.release("target")
+    (placed,) = page.placed()
+    assert_aims(placed.settings, pose[:3], [OFFSET[0] + 0.1, *target[1:]], None)
 
 
 @pytest.mark.parametrize("mount", [None, MOUNT], ids=["fixed", "mounted"])

@@ -308,6 +308,9 @@ def test_a_report_is_stale_after_a_move_or_a_rebuild_until_the_next_one(desk: De
     )
     assert results.report_over_envs(PEOPLE) is None
     desk.happens(of.CameraPlaced(PEOPLE, MOVED))
+    desk.happens(of.CameraChosen(PEOPLE))
+    assert not desk.view.report_stale, "another camera was moved"
+    desk.happens(of.CameraChosen(BASE))
     desk.happens(of.CameraPlaced(BASE, replace(SETTINGS, position=(0.4, 0.0, 0.6001))))
     assert not desk.view.report_stale, "it was rounded"
     desk.happens(of.CameraPlaced(BASE, MOVED))
@@ -578,6 +581,7 @@ def test_a_change_that_does_not_load_can_be_reverted(desk: Desk) -> None:
     assert desk.edit == before, "a failing step is no failing load"
     desk.happens(TaskFailed(problem(), kept=True, at_run=False))
     assert desk.edit.stage == "written" and desk.edit.message != before.message
+    assert desk.edit.loading, "the author may mend the rest of the file"
     only(desk.happens(RevertCameraChange()), of.ChangeFile)
     desk.happens(of.FileChanged())
     written = desk.edit.message
