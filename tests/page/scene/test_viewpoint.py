@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -131,6 +133,103 @@ def test_a_page_is_reframed_on_resize_until_the_user_moves_the_view(
         assert framing.is_new("live")
         framing.frame_new(frame)
         assert np.allclose(client.camera.position, moved), "the view is kept after the review"
+
+
+def test_a_narrow_view_stands_farther_back_and_without_a_human_camera_the_actors_fill_it() -> None:
+    layout = lay_out(*table_scene(1))
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    picture = Picture("render_camera", "human", 0, pose)
+    wide, narrow = (frame_one(layout, picture, aspect) for aspect in (2.0, 0.5))
+    np.testing.assert_allclose(wide.look_at, narrow.look_at, atol=1e-6)
+    away = [np.linalg.norm(one.position - one.look_at) for one in (wide, narrow)]
+    assert away[1] == pytest.approx(2 * away[0])
+    behind = frame_one(
+        layout, Picture("render_camera", "human", 0, np.array([-9, 0, 0.4, 0, 0, 0, 1], np.float32))
+    )
+    assert behind.look_at[0] < -9, "a camera that looks away still looks ahead"
+    box = np.array([-0.1, -0.1, 0.0]), np.array([0.1, 0.1, 0.2])
+    assert (
+        frame_one(layout, None, 1.5, acting=box).position.tolist() == frame_box(*box, 1.5).position.tolist()
+    )
+    assert (
+        frame_one(layout, None, 1.5).position.tolist()
+        == frame_box(layout.low, layout.high, 1.5).position.tolist()
+    )
+
+
+class Pages:
+    """A stub server with open pages."""
+
+    def __init__(self, *numbers: int) -> None:
+        self.initial_camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
+        self.open = {number: self._page(number) for number in numbers}
+
+    def _page(self, number: int) -> Any:
+        at = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3), image_width=800, image_height=720)
+        return SimpleNamespace(client_id=number, camera=at)
+
+    def comes(self, number: int) -> Any:
+        page = self.open[number] = self._page(number)
+        page.camera.position = np.array(self.initial_camera.position)
+        return page
+
+    def get_clients(self) -> dict[int, Any]:
+        return dict(self.open)
+
+
+def test_each_page_keeps_its_own_view_of_each_scene() -> None:
+    pages = Pages(1, 2)
+    framing = Framing(cast(Any, pages))
+    eyes = [pages.open[number].camera for number in (1, 2)]
+
+    def shows(what: str, x: float) -> None:
+        if framing.is_new(what):
+            framing.frame_new(lambda aspect: Viewpoint(np.array([x, 0.0, 1.0]), np.array([x, 0.0, 0.0])))
+
+    shows("one", 10.0)
+    assert [eye.position[0] for eye in eyes] == [10, 10] and pages.initial_camera.position[0] == 10
+    assert framing.pointed == {1, 2} and framing.follow() == 2
+    eyes[1].position, eyes[1].look_at = np.array([11.0, 5, 5]), np.array([1.0, 2, 3])
+    shows("one", 99.0)
+    assert [eye.position[0] for eye in eyes] == [10, 11], "the same scene is not framed again"
+    shows("two", 20.0)
+    assert [eye.position[0] for eye in eyes] == [20, 20]
+    shows("one", 30.0)
+    assert [eye.position.tolist() for eye in eyes] == [[30, 0, 1], [11, 5, 5]] and eyes[
+        1
+    ].look_at.tolist() == [1, 2, 3]
+    shows("two", 40.0)
+    assert [eye.position[0] for eye in eyes] == [40, 40], "it was not moved there"
+    late = pages.comes(3).camera
+    assert late.position[0] == 40
+    framing.frame(lambda aspect: Viewpoint(np.array([50.0, 0, 1]), np.zeros(3)), untouched_only=True)
+    assert [eye.position[0] for eye in (*eyes, late)] == [50, 50, 50]
+    eyes[0].position = np.array([7.0, 7, 7])
+    framing.frame(lambda aspect: Viewpoint(np.array([60.0, 0, 1]), np.zeros(3)), untouched_only=True)
+    assert [eye.position[0] for eye in (*eyes, late)] == [7, 60, 60]
+    del pages.open[2]
+    assert framing.follow() == 2 and framing.pointed == {1, 3}
+
+
+def test_an_untouched_page_is_framed_again_only_when_its_shape_changes() -> None:
+    pages, framed = Pages(1), list[float]()
+    framing, eye = Framing(cast(Any, pages)), pages.open[1].camera
+
+    def frame(aspect: float) -> Viewpoint:
+        framed.append(aspect)
+        return Viewpoint(np.array([aspect, 0.0, 1.0]), np.zeros(3))
+
+    framing.frame(frame)
+    for width, times in ((800, 0), (830, 0), (900, 1), (900, 1), (0, 2)):
+        eye.image_width = width
+        before = len(framed) if width == 800 else before  # noqa: F821
+        framing.frame_untouched(frame)
+        assert len(framed) == before + times, width
+    assert framed[-1] == pytest.approx(1.385), "a folded view has no shape"
+    eye.position = eye.position + 1
+    eye.image_width = 300
+    framing.frame_untouched(frame)
+    assert len(framed) == before + 2
 
 
 def test_choices_of_the_view_apply_to_later_pages(panels: Panels) -> None:

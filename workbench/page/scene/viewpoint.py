@@ -170,12 +170,18 @@ class Framing:
 
     def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:
         """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
+        clients = self._server.get_clients()
+        # Before the initial viewpoint changes: a page may still be at the present one.
+        framed = [
+            client
+            for number, client in clients.items()
+            if number not in but and (not untouched_only or self._is_untouched(client))
+        ]
         usual = frame(DEFAULT_ASPECT)
         self._server.initial_camera.position = usual.position
         self._server.initial_camera.look_at = usual.look_at
-        for number, client in self._server.get_clients().items():
-            if number not in but and (not untouched_only or self._is_untouched(client)):
-                self._point(client, frame)
+        for client in framed:
+            self._point(client, frame)
 
     def frame_untouched(self, frame: Frame) -> None:
         """Frame the scene again in each untouched page whose viewpoint or aspect ratio differs from the framed one."""
