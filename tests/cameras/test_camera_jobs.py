@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from workbench.cameras import events as of
 from workbench.cameras.apply import StudioJobs
 from workbench.cameras.questions import DrawCamera, MeasureCamera, SuggestCameras
 from workbench.cameras.report_jobs import FIRST_SEED, MAX_ENVS, pick_pixel
-from workbench.cameras.view import EditRequest, MeasuredMoment
+from workbench.cameras.view import EditRequest, EditState, MeasuredMoment
 from workbench.envs.camera_data import Picture
 from workbench.live.history.moments import ShownMoment
 from workbench.live.messages import Load, Reset
@@ -25,6 +26,7 @@ from workbench.live.process.background_jobs import JobFailed
 from workbench.machine.loop import do
 from workbench.pictures.camera_conventions import compose, make_pose, quaternion_from_rpy
 from workbench.pictures.camera_report import CameraReport, DepthReport, SearchSpace
+from workbench.task.write_edits import SourceEdit
 
 Answered = TypeVar("Answered")
 
@@ -143,7 +145,7 @@ def load(num_envs: int, **kwargs: object) -> Load:
 
 
 def test_every_seed_is_measured_once_in_its_own_env_even_after_an_interruption() -> None:
-    for interrupted in (-1, 0, 1, 3, 4, 6):
+    for interrupted in range(-1, 8):
         desk = Desk(background=Asker(num_envs=2, fails_at=interrupted, error=Preempted))
         made = reports(desk.performs(of.MeasureSeeds("measuring", QUESTION, SETTINGS, load(2), 5)))
         assert [(one.seeds, one.report.envs) for one in made] == [
@@ -281,3 +283,60 @@ def test_stopped_jobs_of_a_lane_end_and_the_other_lanes_go_on() -> None:
     assert desk.jobs.progress is None
     until(lambda: desk.happened.count(of.Measuring(False)) == 2, "the end of the other")
     assert not [one for one in desk.happened if isinstance(one, of.WorkFailed)]
+
+
+# --- the author's file --------------------------------------------------------------------------------
+
+
+def test_a_change_is_written_reverted_and_refused_in_a_file_that_was_edited_since(tmp_path: Path) -> None:
+    desk, file = Desk(), tmp_path / "push.py"
+    file.write_text("old")
+    edit = SourceEdit(str(file), "old", "new", (), SETTINGS)
+
+    def changes(revert: bool) -> Any:
+        do(lambda: desk.jobs.perform(of.ChangeFile(edit, revert)))
+        until(lambda: desk.happened, "the end of the edit")
+        return desk.happened.pop()
+
+    for _ in range(2):
+        assert changes(revert=False) == of.FileChanged() and file.read_text() == "new"
+        assert changes(revert=True) == of.FileChanged() and file.read_text() == "old"
+    file.write_text("edited")
+    for revert in (False, True):
+        assert isinstance(changes(revert), of.FileNotChanged) and file.read_text() == "edited"
+
+
+def test_a_plan_needs_the_hooks_of_the_running_version_and_none_begins_while_closing(tmp_path: Path) -> None:
+    task, file = runs()[0].task, tmp_path / "push.py"
+    assert task is not None
+    file.write_text("class PushEnv:\n    pass\n")
+    task = replace(task, file=str(file), source_files=(str(file),), source={str(file): file.read_text()})
+    request = EditRequest("add", ("sensor", "new"), SETTINGS)
+    desk = Desk(Asker(fails_at=0))
+
+    def found(load: Load | None) -> EditState:
+        do(lambda: desk.jobs.perform(of.FindPlan(request, task, None, load)))
+        until(lambda: desk.happened, "the plan")
+        event = desk.happened.pop()
+        assert isinstance(event, of.PlanFound) and event.request == request
+        return event.state
+
+    running = runs()[0].running_load()
+    state = found(running)
+    assert state.stage == "refused" and "it failed" in state.message
+    assert found(None).stage == "refused" and desk.live.asked == []
+    desk.jobs.close()
+    assert desk.happened == [of.StudioClosed()]
+
+
+def test_a_bug_in_an_edit_is_told_and_the_copy_of_a_task_is_opened(tmp_path: Path) -> None:
+    desk, task = Desk(), runs()[0].task
+    assert task is not None
+    broken: Any = None
+    do(lambda: desk.jobs.perform(of.ChangeFile(broken, False)))
+    until(lambda: desk.happened, "the failure")
+    assert isinstance(desk.happened.pop(), of.EditFailed)
+    do(lambda: desk.jobs.perform(of.CopyToFolder(replace(task, file=None), tmp_path)))
+    until(lambda: desk.happened, "the refusal")
+    (copied,) = desk.happened
+    assert copied.file is None and copied.state.stage == "refused" and [*tmp_path.iterdir()] == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from workbench.pictures.camera_report import CameraReport, DepthReport, ObjectSeen, join_reports
+from workbench.pictures.camera_report import (
+    CameraReport,
+    DepthReport,
+    ObjectSeen,
+    join_reports,
+    report_text,
+    size_text,
+)
+from workbench.pictures.camera_search import score_of
 
 NAN = float("nan")
 
@@ -135,3 +144,40 @@ def test_reports_of_different_cameras_or_scenes_are_not_joined(changes: Any, say
     first = report(thing())
     with pytest.raises(ValueError, match=says):
         join_reports([first, first, replace(first, **changes)])
+
+
+def test_the_text_of_a_report_names_the_wanted_objects_with_their_numbers() -> None:
+    cube = thing("cube", pixels=[10, 0, 4], unhindered=[20, 0, 4], cut=[False, False, True])
+    ball = thing("ball", pixels=[12, 12, 12], present=[True, False, True])
+    absent = thing("absent", pixels=[0] * 3, present=False)
+    found = report(cube, ball, absent, thing("table", pixels=[9] * 3), envs=(0, 1, 2))
+    first, second = report_text(found, ("ball", "cube", "absent")).split("; ")
+    assert first.startswith("cube: ") and second.startswith("ball: ")
+    assert re.findall(r"\d+(?:\.\d+)?", first) == ["2", "3", "4", "8.3", "33", "25"]
+    assert re.findall(r"\d+(?:\.\d+)?", second) == ["2", "2", "12", "25"]
+
+
+@pytest.mark.parametrize(
+    ("pixels", "text"), [(0, "0 %"), (0.5, "< 0.01 %"), (21, "0.21 %"), (990, "9.9 %"), (1234, "12 %")]
+)
+def test_a_small_share_has_two_digits(pixels: float, text: str) -> None:
+    assert size_text(pixels, (200, 50)) == text
+
+
+def test_a_score_is_between_the_mean_and_the_worst_env_less_near_a_border_or_an_obstacle() -> None:
+    def score(nearest: list[float] | float = 1.0, wanted: tuple[str, ...] = ("cube",), **given: Any) -> float:
+        cube = thing("cube", **given)
+        ball = thing("ball", pixels=[25.0] * len(cube.pixels))
+        return score_of(report(cube, ball, envs=tuple(range(len(cube.pixels))), depth=depth(nearest)), wanted)
+
+    assert score() == 1.0
+    assert score([1.0, 1.0], pixels=[100, 25]) == pytest.approx((0.75 + 0.5) / 2)
+    assert score([1.0, 1.0], pixels=[100, 25], present=[True, False]) == 1.0, "only envs that have it"
+    assert score([1.0, 1.0], pixels=[100, 0]) == pytest.approx(0.25)
+    assert score(wanted=("cube", "ball")) == 0.5, "the worst of the wanted objects"
+    assert score(margin=0.05) == pytest.approx(0.9) and score(margin=0.0) == pytest.approx(0.8)
+    assert score(0.05) == pytest.approx(0.5) and score(NAN) == 0.0
+    assert score([0.05, 1.0], pixels=[100, 100]) == pytest.approx((0.75 + 0.5) / 2), (
+        "each env has its own room"
+    )
+    assert score(present=False) == 0.0

@@ -111,6 +111,60 @@ def test_suggestions_for_a_mounted_camera_are_upright_and_in_the_links_frame(
         suggest_cameras(env, replace(space, mount="panda/tail"), [0])
 
 
+def test_placements_are_searched_in_the_given_env_only(env: Any) -> None:
+    space = SearchSpace(("cube",), LOW, HIGH, LENS, candidates=6, best=2, apart=0.2)
+    progress: list[tuple[int, int]] = []
+    found = suggest_cameras(env, space, [1], progress=lambda done, total: progress.append((done, total)))
+    assert found and [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+    eyes = [np.array(one.settings.position) for one in found]
+    assert all(np.linalg.norm(a - b) >= 0.2 for i, a in enumerate(eyes) for b in eyes[:i])
+    for one, eye in zip(found, eyes, strict=True):
+        assert one.report.envs == (1,) and one.picture.env == 1
+        assert (
+            (eye >= LOW).all()
+            and (eye <= HIGH).all()
+            and one.report.wanted_objects(["cube"])[0].pixels[0] > 0
+        )
+        assert one.score == score_of(one.report, ("cube",))
+        assert one.picture.rgb is not None and one.picture.rgb.shape == (64, 96, 3)
+    assert progress[-1][0] == progress[-1][1] and [done for done, _ in progress[:3]] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("change", "envs", "says"),
+    [
+        ({"objects": ("dragon",)}, [0], "'dragon'.*cube, goal_region"),
+        ({"objects": ("ground",)}, [0], "'ground'"),
+        ({"objects": ("panda",)}, [0], "name links of it"),
+        ({"objects": ()}, [0], "at least one object"),
+        ({"low": (1.0, 0.0, 0.0), "high": (0.5, 1.0, 1.0)}, [0], "lower corner"),
+        ({"high": (math.nan, 1.0, 1.0)}, [0], "finite"),
+        ({"candidates": 0}, [0], "at least 1"),
+        ({"best": 0}, [0], "at least 1"),
+        ({}, [], "at least one env"),
+    ],
+)
+def test_a_search_that_can_find_nothing_is_refused(
+    env: Any, change: dict[str, Any], envs: list[int], says: str
+) -> None:
+    space = replace(SearchSpace(("cube",), LOW, HIGH, LENS), **change)
+    with pytest.raises(ValueError, match=says):
+        suggest_cameras(env, space, envs)
+    with pytest.raises(IndexError):
+        suggest_cameras(env, SearchSpace(("cube",), LOW, HIGH, LENS), [N])
+
+
+def test_objects_to_see_are_the_tasks_and_the_robots_links_from_the_hand(env: Any) -> None:
+    *objects, robot = objects_to_see(env)
+    assert [(thing.name, thing.hidden, thing.links, thing.robot) for thing in objects] == [
+        ("cube", False, (), False),
+        ("goal_region", False, (), False),
+    ]
+    assert robot.robot and robot.name == "panda" and robot.links[0] == "panda/panda_hand"
+    assert set(robot.links[1:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger"}
+    assert "panda/panda_link0" in robot.links and "panda/panda_hand_tcp" not in robot.links
+
+
 @pytest.mark.slow
 def test_the_robots_hand_can_be_a_wanted_object_that_the_arm_hides(env: Any) -> None:
     (robot,) = (thing for thing in objects_to_see(env) if thing.robot)

@@ -166,6 +166,41 @@ def test_an_object_is_cut_exactly_when_it_reaches_a_border(
             assert over.alone[0] > 0.5 * near.alone[0] > 10
 
 
+def test_a_robot_out_of_view_and_scenery_take_no_pictures_of_their_own(env: Any) -> None:
+    x, y, _ = cube_at(env, 0)
+    away, at_robot = (
+        looking(LookAt((x, y, 0.3), (x, y, 0.0)), fov=0.3),
+        looking(LookAt((1.0, 0.0, 0.6), (-0.6, 0.0, 0.3))),
+    )
+    drawn = [thing.name for thing in measure_placement(env, 0, Placement(away)).wanted_objects()]
+    assert set(drawn) == {"cube", "goal_region"}
+    assert measure_placement(env, 0, Placement(away)).pictures == 3
+    assert measure_placement(env, 0, Placement(at_robot)).pictures == 4
+    sky = measure_placement(env, 0, Placement(looking(LookAt((0, 0, 1), (0, 0, 2)))))
+    assert (
+        sky.depth.background[0] == 1
+        and np.isnan(sky.depth.nearest[0])
+        and np.isnan(sky.depth.farthest_object[0])
+    )
+    floor = measure_placement(env, 0, Placement(looking(LookAt((-3, 0, 1), (-4, 0, 0)))))
+    assert floor.depth.beyond[0] == 1 - floor.depth.background[0] > 0, (
+        "nothing but the floor is beyond all objects"
+    )
+
+
+def test_a_camera_or_env_that_is_not_there_is_named(env: Any) -> None:
+    with pytest.raises(
+        ValueError, match=r"human camera 'base_camera'.*base_camera \(sensor\), render_camera \(human\)"
+    ):
+        placement_of(env, ("human", "base_camera"), 0)
+    with pytest.raises(IndexError):
+        placement_of(env, SENSOR, N)
+    poses = read_poses(env)[0]
+    poses[scene_index(env).names.index("cube")] = np.nan
+    with pytest.raises(ValueError, match="no body 'cube'"):
+        measure_placement(env, 0, Placement(looking(FAR_FLOOR), mount="cube"), poses=poses)
+
+
 def test_a_smaller_picture_has_the_same_view_and_scales_its_counts(env: Any) -> None:
     x, y, _ = cube_at(env, 0)
     settings = looking(LookAt((x - 0.3, y, 0.5), (x, y, 0)), width=320, height=200, fov=0.8)

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 import viser
 
+from tests.drive.panels import Panels
 from tests.drive.scenes import table_scene
 from workbench.envs.scene.shapes import Material, Mesh
 from workbench.page.scene.bodies import REMOVAL_DELAY_SECONDS, DrawStyle, SceneView
@@ -140,3 +141,57 @@ def test_simplified_meshes_replace_the_finer_ones_with_a_delay(server: viser.Vis
     view.move(poses, layout, None)
     assert server.scene.get_handle_by_name(fine.name) is None
     assert server.scene.get_handle_by_name(simple.name) is simple
+
+
+def test_hidden_bodies_stay_in_the_browser_and_cleared_ones_do_not(panels: Panels) -> None:
+    geometry, poses = table_scene(2)
+    layout, view = lay_out(geometry, poses), SceneView(panels.server)
+    view.build(geometry, layout, poses)
+    handles = view.handles
+    view.hide()
+    assert not any(handle.visible for handle in handles) and len(panels.nodes("/envs/")) == len(handles)
+    view.build(geometry, layout, poses)
+    assert view.handles == handles and all(handle.visible for handle in handles)
+    view.clear()
+    assert panels.nodes("/envs/") == [] and view.handles == ()
+    view.build(geometry, layout, poses)
+    assert all(handle.visible for handle in view.handles) and len(panels.nodes("/envs/")) == len(handles)
+
+
+def test_a_scene_without_a_floor_stands_on_a_grid_around_all_envs(panels: Panels) -> None:
+    geometry, poses = table_scene(4)
+    bare = replace(geometry, visuals=geometry.visuals[1:])
+    layout, view = lay_out(bare, poses), SceneView(panels.server)
+    view.build(bare, layout, poses)
+    (grid,) = panels.nodes("/floor")
+    low, high = layout.box_of_all()
+    assert grid.width > high[0] - low[0] and grid.height > high[1] - low[1]
+    assert grid.position[2] == layout.floor_height == layout.low[2]
+    view.build(geometry, lay_out(geometry, poses), poses)
+    assert panels.nodes("/floor") == []
+
+
+def test_a_new_scene_replaces_the_shapes_of_the_old_one_at_once(panels: Panels) -> None:
+    """Only finer or coarser shapes of the same scene overlap for a moment."""
+    geometry, poses = table_scene(2)
+    layout, view = lay_out(geometry, poses), SceneView(panels.server)
+    view.build(geometry, layout, poses)
+    fewer = replace(geometry, visuals=geometry.visuals[:3])
+    view.build(fewer, layout, poses)
+    assert len(panels.nodes("/envs/")) == len(view.handles) == 3
+    view.build(geometry, layout, poses, only_env=1)
+    cube = handle_named(view, "cube")
+    np.testing.assert_allclose(cube.batched_positions, poses[1:, 3, :3])
+
+
+def test_a_body_that_moves_only_in_one_env_moves_there(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(3)
+    layout, view = lay_out(geometry, poses), SceneView(server)
+    view.build(geometry, layout, poses)
+    for env in (2, 0):
+        poses = poses.copy()
+        poses[env, 3, 1] += 0.5
+        view.move(poses, layout, None)
+        np.testing.assert_allclose(
+            handle_named(view, "cube").batched_positions, poses[:, 3, :3] + layout.offsets, atol=1e-6
+        )

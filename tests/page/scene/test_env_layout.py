@@ -5,9 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.drive.panels import Panels
 from tests.drive.scenes import box_mesh, table_scene, visual
 from workbench.envs.scene.shapes import SceneGeometry
-from workbench.page.scene.env_grid import env_under_ray, grid_offsets, lay_out, place_of_plane, plane_normal
+from workbench.page.scene.env_grid import (
+    SelectionMark,
+    acting_box,
+    env_under_ray,
+    grid_offsets,
+    lay_out,
+    place_of_plane,
+    plane_normal,
+)
 
 
 def test_the_box_of_an_env_contains_its_bodies_but_not_its_floor() -> None:
@@ -107,3 +116,64 @@ def test_the_box_of_a_body_rotates_with_it_by_the_right_hand_rule() -> None:
     normal = plane_normal(wall, standing, np.array([[quarter_about_z]], np.float32))
     assert normal is not None
     np.testing.assert_allclose(normal, [-1, 0, 0], atol=1e-6)
+
+
+def test_the_first_envs_are_in_front_from_left_to_right() -> None:
+    offsets = grid_offsets(6, np.array([1.0, 1.0]))
+    assert offsets[:, 0].tolist() == [0.5, 0.5, 0.5, -0.5, -0.5, -0.5]
+    assert offsets[:, 1].tolist() == [-1, 0, 1, -1, 0, 1] and not offsets[:, 2].any()
+    assert grid_offsets(1, np.array([1.0, 2.0])).tolist() == [[0, 0, 0]]
+    many = grid_offsets(100, np.array([1.0, 1.0]))
+    deep, wide = np.ptp(many[:, :2], axis=0)
+    assert 1.2 < wide / deep < 1.7
+
+
+def test_a_scene_of_nothing_has_a_box_and_a_wall_belongs_to_its_own_side() -> None:
+    geometry, poses = table_scene(2)
+    nothing = lay_out(SceneGeometry(2, (), (), (), ()), np.zeros((2, 0, 7), np.float32))
+    assert (nothing.high > nothing.low).all() and not nothing.has_floor
+    layout = lay_out(*table_scene(9))
+    for y, sign in ((2.0, 1), (-2.0, -1)):
+        wall = visual("wall", box_mesh((40, 0.01, 20)), 9, 0)
+        at = np.tile(np.array([0, y, 0, 1, 0, 0, 0], np.float32), (9, 1, 1))
+        for normal in ([0.0, 1.0, 0.0], [0.0, -1.0, 0.0]):
+            place = place_of_plane(np.array(normal), wall, at, layout)
+            assert place[1] == pytest.approx(sign * layout.offsets[:, 1].max())
+    assert place_of_plane(np.array([0.0, 0.1, 0.99]), geometry.visuals[0], poses, layout).tolist() == [
+        0,
+        0,
+        0,
+    ]
+
+
+def test_the_acting_box_contains_robots_and_movable_bodies_within_the_env() -> None:
+    geometry, poses = table_scene(3)
+    layout = lay_out(geometry, poses)
+    poses[:, 3, :3] = [[0.1, 0.2, 0.02], [0.3, -0.4, 0.02], [np.nan] * 3]
+    low, high = acting_box(geometry, poses, layout)
+    np.testing.assert_allclose(low, np.array([0, -0.4, 0.02]) - 0.08, atol=1e-6)
+    np.testing.assert_allclose(high, np.array([0.3, 0.2, 0.5]) + 0.08, atol=1e-6)
+    poses[0, 3, :3] = [50.0, 0.2, -30.0]
+    low, high = acting_box(geometry, poses[:1], layout)
+    np.testing.assert_allclose([low[2], high[0]], [layout.low[2] - 0.08, layout.high[0] + 0.08], atol=1e-6)
+    poses[:, 2:] = np.nan
+    assert acting_box(geometry, poses, layout) == (layout.low, layout.high)
+
+
+def test_the_mark_frames_the_selected_env_at_the_height_of_the_table(panels: Panels) -> None:
+    layout, mark = lay_out(*table_scene(4)), SelectionMark(panels.server)
+    for env in (0, 3):
+        mark.draw(layout, env, shown=True)
+        (frame,) = panels.nodes("/selected/frame")
+        corners = frame.points.reshape(-1, 3)
+        low, high = layout.low + layout.offsets[env], layout.high + layout.offsets[env]
+        assert (corners.min(axis=0)[:2] < low[:2]).all() and (corners.max(axis=0)[:2] > high[:2]).all()
+        np.testing.assert_allclose(corners.mean(axis=0)[:2], ((low + high) / 2)[:2], atol=1e-5)
+        np.testing.assert_allclose(corners[:, 2], 0.01, atol=1e-6)
+        assert panels.labels() == [f"env {env}"]
+    mark.draw(layout, 3, shown=True, name="B")
+    assert panels.labels() == ["B"]
+    mark.draw(layout, 3, shown=False)
+    assert panels.labels() == [] and panels.nodes("/selected/frame") == []
+    mark.draw(layout, 3, shown=True, name="B")
+    assert panels.labels() == ["B"]

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from tests.drive.scenes import box_mesh
-from workbench.envs.scene.shapes import Material
-from workbench.page.scene.glb import LAYER_METRES, as_glb, lift_painted_layers
+from tests.drive.scenes import box_mesh, visual
+from workbench.envs.scene.shapes import Material, Mesh
+from workbench.page.scene.glb import LAYER_METRES, as_glb, face_limit, lift_painted_layers, lightened
 
 
 def read_back(glb: bytes) -> list[Any]:
@@ -56,3 +56,52 @@ def test_flat_painted_layers_are_separated_and_solids_are_not() -> None:
     tops = [float(mesh.vertices[:, 2].max()) for mesh in lifted]
     assert np.diff(tops).min() > 0.9 * LAYER_METRES
     assert same is solid
+
+
+def strip_of(triangles: int) -> Mesh:
+    vertices = np.zeros((triangles + 2, 3), np.float32)
+    faces = np.stack([np.arange(triangles) + k for k in range(3)], axis=1).astype(np.uint32)
+    return Mesh(vertices, faces)
+
+
+def test_the_triangles_of_all_shown_instances_stay_within_the_budget() -> None:
+    visuals = visual("a", strip_of(50_000), 4, 0), visual("b", strip_of(300), 4, 1)
+    assert face_limit(visuals, 4, 4, 10**9) == 50_000, "all of them fit"
+    for shown in (1, 2, 4):
+        limit = face_limit(visuals, shown, 4, 40_000)
+        used = [shown * (min(50_000, one) + min(300, one)) for one in (limit, limit + 1)]
+        assert used[0] <= 40_000 < used[1]
+    assert face_limit(visuals, 4, 4, 100) == 200, "a shape needs some"
+    assert face_limit((), 1, 1, 100) == 200
+
+
+def test_a_dark_floor_is_lightened_and_a_light_one_is_not() -> None:
+    texture = np.full((4, 4, 4), 100, np.uint8)
+    texture[..., 3] = 7
+    dark = lightened(Material((1, 1, 1, 1), texture=texture))
+    assert dark.texture is not None
+    assert (dark.texture[..., :3] == 208).all() and (dark.texture[..., 3] == 7).all()
+    light = Material((1, 1, 1, 1), texture=np.full((4, 4, 3), 200, np.uint8))
+    assert lightened(light) is light
+    colours = Material((0.1, 0.2, 0.3, 0.5)), Material((0.9, 0.9, 0.9, 1.0))
+    lighter = lightened(colours[0])
+    assert lighter.base_color[3] == 0.5 and all(
+        one > was + 0.5 for one, was in zip(lighter.base_color[:3], colours[0].base_color)
+    )
+    assert lightened(colours[1]) is colours[1]
+
+
+def test_a_large_texture_is_shrunk_and_only_a_transparent_one_is_blended() -> None:
+    box = box_mesh((1, 1, 1))
+    mesh = replace(box, uvs=np.zeros((len(box.vertices), 2), np.float32))
+    opaque = np.full((1500, 3000, 4), 255, np.uint8)
+    holes = np.full((8, 8, 4), 255, np.uint8)
+    holes[0, 0, 3] = 0
+    for pixels, size, mode in ((opaque, (1024, 512), "OPAQUE"), (holes, (8, 8), "BLEND")):
+        (part,) = read_back(as_glb([(mesh, Material((1, 1, 1, 1), texture=pixels))]))
+        assert part.visual.material.baseColorTexture.size == size
+        assert part.visual.material.alphaMode == mode
+    shining = Material((1, 1, 1, 1), metallic=1.0, roughness=0.25)
+    (part,) = read_back(as_glb([(box, shining)]))
+    assert part.visual.material.metallicFactor < 0.5 and part.visual.material.roughnessFactor == 0.25
+    assert part.visual.material.doubleSided

@@ -113,3 +113,23 @@ def test_the_pixel_size_is_that_of_the_nearest_env_and_eye() -> None:
     assert np.isclose(pixel_of((far, near), layout, alone=False), 0.002)
     # A single env is shown at the origin, whichever it is.
     assert np.isclose(pixel_of((Eye(above, 0.001),), layout, alone=True), 0.002)
+
+
+def test_light_scenes_and_finer_choices_are_not_simplified() -> None:
+    server: Any = Server()
+    in_software = InSoftware(server)
+    geometry, layout = heavy_scene()
+    light, poses = table_scene(2)
+    server.come(1)
+    in_software.report_arrived(server.visitor(1))
+    until(lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 0, "simpler shapes")
+    assert in_software.looks(DrawStyle(), light, lay_out(light, poses), alone=False).error == 0
+    assert in_software.looks(DrawStyle(), geometry, layout, alone=True).error == 0, (
+        "one env has few triangles"
+    )
+    style = DrawStyle(50_000, dark=False)
+    simple = in_software.looks(style, geometry, layout, alone=False)
+    assert simple.error > 0 and replace(simple, error=0.0) == style
+    other, _ = heavy_scene()
+    assert in_software.looks(style, other, layout, alone=False).error == 0, "its shapes are not made yet"
+    server.leave(1)

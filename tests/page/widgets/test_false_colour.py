@@ -1,13 +1,20 @@
 from __future__ import annotations
 
+import base64
+import io
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from PIL import Image
 
+from workbench.envs.camera_data import Picture
 from workbench.page.widgets.modality_colours import (
     MAX_LEGEND_ENTRIES,
+    MODALITIES,
     NOTHING,
     VIRIDIS,
     DepthRange,
@@ -15,7 +22,12 @@ from workbench.page.widgets.modality_colours import (
     colour_normal,
     colour_position,
     colour_segmentation,
+    data_address,
     depth_range,
+    depth_span,
+    image_format,
+    in_colours,
+    narrowed,
     segment_colour,
     segments_seen,
 )
@@ -87,3 +99,64 @@ def test_positions_use_the_whole_scale_and_the_background_is_dark(position: np.n
     farthest_right = np.where(met, position[..., 0], -np.inf)
     if met.sum() > 1 and np.ptp(position[met][:, 0]) > 0.1:
         assert (coloured[farthest_right == farthest_right.max()][:, 0] == 255).all()
+
+
+PICTURE = Picture("eye", "sensor", 0, np.zeros(7, np.float32))
+DEPTH = np.linspace(1, 2, 12, dtype=np.float32).reshape(3, 4)
+
+
+def test_a_picture_is_shown_in_each_modality_that_it_has() -> None:
+    ids = np.array([[0, 1], [1, 1]], np.int32)
+    normal, position = np.zeros((2, 2, 3), np.float32), np.full((2, 2, 3), -1.0, np.float32)
+    position[0, 0] = 3.0
+    grey = np.full((2, 2, 3), 7, np.uint8)
+    has = {
+        "rgb": grey,
+        "depth": DEPTH[:2, :2],
+        "segmentation": ids,
+        "position": position,
+        "normal": normal,
+        "albedo": grey + 1,
+    }
+    for modality in MODALITIES:
+        assert in_colours(PICTURE, modality, {}, None) is None
+        shown = in_colours(
+            replace(PICTURE, **{modality: has[modality]}), modality, {1: "cube"}, DepthRange(0.5, 4.25)
+        )
+        assert shown is not None and shown[0].shape == (2, 2, 3)
+        if modality == "depth":
+            np.testing.assert_array_equal(shown[0], colour_depth(DEPTH[:2, :2], DepthRange(0.5, 4.25)))
+            assert "0.50" in shown[1] and "4.25" in shown[1]
+        if modality == "segmentation":
+            assert "cube" in shown[1] and "background" in shown[1]
+            assert "rgb({},{},{})".format(*segment_colour(1)) in shown[1]
+        if modality in ("rgb", "albedo"):
+            np.testing.assert_array_equal(shown[0], has[modality])
+    assert {modality for modality in MODALITIES if image_format(modality) == "png"} == {"segmentation"}
+
+
+def test_the_range_of_depth_widens_and_never_narrows() -> None:
+    near, far = replace(PICTURE, depth=DEPTH), replace(PICTURE, depth=DEPTH + 3)
+    first = depth_span(None, near)
+    assert first is not None and depth_span(first, PICTURE) is first and depth_span(None, PICTURE) is None
+    both = depth_span(first, far)
+    assert both is not None and (both.near, both.far > 4.5) == (first.near, True)
+    assert depth_span(both, near) == both and depth_span(depth_span(None, far), near) == both
+
+
+def test_a_large_picture_is_averaged_to_the_longest_side_and_a_small_one_is_not() -> None:
+    stripes = np.zeros((60, 200, 3), np.uint8)
+    stripes[:, ::2] = 200
+    for pixels, longest, size in (
+        (stripes, 100, (100, 30)),
+        (np.swapaxes(stripes, 0, 1), 100, (30, 100)),
+        (stripes, 200, (200, 60)),
+    ):
+        kind, _, data = data_address(pixels, longest).partition(",")
+        image = Image.open(io.BytesIO(base64.b64decode(data)))
+        assert kind == "data:image/jpeg;base64" and image.size == size
+        assert np.asarray(image).mean() == pytest.approx(100, abs=3)
+    half = narrowed(stripes, 100, smooth=True)
+    assert half.shape == (30, 100, 3) and (half == 100).all()
+    assert set(np.unique(narrowed(stripes, 100, smooth=False))) <= {0, 200}
+    assert narrowed(stripes, 200, smooth=True) is stripes

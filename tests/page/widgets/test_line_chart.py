@@ -12,7 +12,18 @@ from hypothesis import strategies as st
 from tests.drive.charts import charts_in
 from tests.drive.panels import Panels
 from workbench.live.timeline_commands import Seek
-from workbench.page.widgets.line_chart import YES_OR_NO, ChartLine, LineChart, chart_html, span_of, ticks
+from workbench.page.widgets.line_chart import (
+    MAX_POINTS,
+    YES_OR_NO,
+    ChartLine,
+    LineChart,
+    chart_html,
+    drawn_span,
+    part_round,
+    polylines,
+    span_of,
+    ticks,
+)
 from workbench.page.widgets.templates import asks
 
 X = np.arange(3.0)
@@ -78,3 +89,37 @@ def test_an_axis_has_a_few_round_numbers_within_its_ends(low: float, size: float
 def test_booleans_have_a_fixed_range_and_numbers_the_range_of_the_data() -> None:
     assert span_of((np.array([0.0, np.nan, 1.0]), np.zeros(2))) == YES_OR_NO
     assert span_of((np.array([0.0, 0.5]),)) is None
+
+
+def test_a_part_of_a_long_curve_is_around_the_shown_step_or_at_the_newest() -> None:
+    half = MAX_POINTS // 2
+    for count, place, part in (
+        (100, None, (0, 100)),
+        (100, 5, (0, 100)),
+        (2 * MAX_POINTS, None, (MAX_POINTS, 2 * MAX_POINTS)),
+        (2 * MAX_POINTS, 5, (0, MAX_POINTS)),
+        (2 * MAX_POINTS, MAX_POINTS, (half, MAX_POINTS + half)),
+        (2 * MAX_POINTS, 2 * MAX_POINTS - 3, (MAX_POINTS, 2 * MAX_POINTS)),
+    ):
+        found = part_round(count, place)
+        assert (found.start, found.stop) == part, (count, place)
+
+
+def test_gaps_split_a_line_and_a_single_point_is_a_dot() -> None:
+    assert polylines([None, "1,1", "2,2", None, None, "3,3", None]) == ["1,1 2,2", "3,3 3,3"]
+    assert polylines([]) == polylines([None]) == []
+
+
+def test_an_axis_fits_its_numbers_and_hides_rounding_errors() -> None:
+    assert drawn_span(-2.0, 3.0) == (-2.0, 3.0)
+    assert drawn_span(1e6, 1e6 + 1) == (500_000.0, 1_500_001.0), "float32 rounds that"
+    assert drawn_span(0.0, 0.0) == (-0.5, 0.5)
+    assert ticks(0.0, 10.0) == [0.0, 5.0, 10.0] and ticks(-0.3, 0.3) == [-0.2, 0.0, 0.2]
+
+
+def test_the_cursor_is_drawn_only_within_the_steps() -> None:
+    for at, shown in ((-1.0, False), (0.0, True), (2.0, True), (2.5, False), (None, False)):
+        (chart,) = charts_in(chart_html("reward", X, LINES, at=at))
+        assert (chart.cursor is not None) is shown, at
+    (chart,) = charts_in(chart_html("reward", X, LINES, at=0.4))
+    assert chart.legend == (("one", "0.5"),), "of the nearest step"
