@@ -430,10 +430,17 @@ def test_a_page_looks_through_the_camera_follows_it_and_returns(page: Page) -> N
     moved = replace(FILE, position=(0.5, 0.3, 0.7))
     page.live.show(chosen(moved))
     assert_looks_through(page, moved)
+    for mount in (MOUNT, make_pose((0, 0, 1), MOUNT[3:]).astype(np.float32)):
+        page.live.show(chosen(moved, mount))
+        np.testing.assert_allclose(
+            eye.position, in_view(moved, mount)[:3], atol=1e-5, err_msg="its mount moved"
+        )
+    page.live.show(chosen(moved))
     around = np.array(eye.position) + 0.5
     page.stands(around)
     page.live.again()
     np.testing.assert_allclose(eye.position, around, err_msg="the user may look around")
+    assert page.live.nodes("/cameras/") == [] and not page.handle("camera").visible
     rolled = with_pose(FILE, compose(pose_of(FILE), make_pose((0, 0, 0), quaternion_from_rpy(40, 0, 0))))
     page.live.show(chosen(rolled))
     np.testing.assert_allclose(eye.up_direction, axes_of(rolled.quaternion)[2], atol=1e-6)

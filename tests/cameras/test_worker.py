@@ -19,11 +19,14 @@ import pytest
 from tests.drive.render_device import RENDER_BACKEND, RENDER_DEVICE
 from workbench.app.worker.questions import QUESTIONS
 from workbench.cameras import worker as under_test
-from workbench.cameras.questions import RunCameras
+from workbench.cameras.questions import DrawCamera, MeasureCamera, RunCameras
 from workbench.cameras.worker import WorkerCameras, run_cameras
-from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
+from workbench.envs.rendering.drawing import CannotDraw
 from workbench.live.messages import (
+    CameraFailed,
     CameraRequest,
+    CannotAnswer,
     DrawPast,
     Event,
     PastPictures,
@@ -248,3 +251,124 @@ def test_a_moment_is_captured_with_pictures_of_the_given_envs(desk: Desk) -> Non
     }
     without = desk.cameras.capture(opened, CaptureMoment(snapshot, (1,), pictures=False))
     assert without.pictures == () and without.columns.keys() == with_pictures.columns.keys()
+
+
+# --- answers to questions ------------------------------------------------------------------------------
+
+
+def no_progress(done: int, total: int) -> None:
+    pass
+
+
+def test_a_scaled_picture_has_its_own_size_and_the_asked_modalities(desk: Desk) -> None:
+    opened = desk.guarded.opened
+    assert opened is not None
+    settings = desk.placed(BASE, width=60, height=40)
+
+    def drawn(scale: float, *modalities: str, key: CameraKey = BASE, env: int = 1) -> Any:
+        question = DrawCamera(key, settings, env, modalities, scale=scale)
+        return desk.cameras.answer(opened, question, no_progress)
+
+    half = drawn(0.5, "rgb", "depth", "segmentation")
+    assert (half.camera, half.kind, half.env) == ("base_camera", "sensor", 1)
+    assert half.rgb.shape == (20, 30, 3) and half.depth.shape == half.segmentation.shape == (20, 30)
+    assert np.allclose(half.pose, [*settings.position, *settings.quaternion], atol=1e-6)
+    double = drawn(2.0)
+    assert double.rgb.shape == (80, 120, 3) and double.depth is None and double.segmentation is None
+    new = drawn(1.0, "rgb", key=("sensor", "new"))
+    assert new.camera == "new" and new.rgb.shape == (40, 60, 3), "a camera that the env does not have"
+    assert np.abs(new.rgb.astype(int)[1::2, 1::2] - half.rgb).mean() < 25, "the same view"
+    for scale in (0.0, -1.0, 4.5):
+        with pytest.raises(CannotAnswer):
+            drawn(scale)
+    with pytest.raises(CannotAnswer):
+        desk.cameras.answer(opened, DrawCamera(("sensor", "new"), None, 0), no_progress)
+    with pytest.raises(CannotAnswer):
+        drawn(0.5, env=2)
+    assert desk.heartbeat.read().doing == "idle"
+
+
+def test_a_picture_with_other_settings_leaves_the_camera_where_it_is(desk: Desk) -> None:
+    opened = desk.guarded.opened
+    assert opened is not None
+
+    def pose(settings: CameraSettings | None, env: int = 1, poses: Any = None) -> list[float]:
+        question = DrawCamera(BASE, settings, env, ("rgb", "albedo"), poses)
+        picture = desk.cameras.answer(opened, question, no_progress)
+        assert isinstance(picture, Picture) and picture.env == env and picture.rgb is not None
+        return picture.pose[:3].tolist()
+
+    there, other = (desk.placed(BASE, position=(0.4, y, 0.7)) for y in (0.1, 0.3))
+    before = pose(None)
+    assert pose(other) == pytest.approx(other.position) and pose(None) == pytest.approx(before)
+    desk.cameras.place_now(opened, PlaceCamera(BASE, there))
+    assert pose(other) == pytest.approx(other.position) and pose(None) == pytest.approx(there.position)
+    assert desk.cameras.placed == {BASE: there}
+    with pytest.raises(CannotAnswer):
+        desk.cameras.answer(opened, DrawCamera(BASE, replace(other, near=20.0), 0), no_progress)
+    assert pose(None) == pytest.approx(there.position), "after a failure too"
+
+
+def test_an_env_is_measured_with_the_given_settings_and_poses(desk: Desk) -> None:
+    opened = desk.guarded.opened
+    assert opened is not None
+
+    def measured(settings: CameraSettings | None = None, env: int = 1, poses: Any = None) -> Any:
+        return desk.cameras.answer(opened, MeasureCamera(BASE, settings, env, poses), no_progress)
+
+    (cube,) = measured().wanted_objects(["cube"])
+    assert cube.pixels[0] > 0 and measured().envs == (1,)
+    sky = desk.placed(BASE, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
+    assert measured(sky).wanted_objects(["cube"])[0].pixels[0] == 0
+    large = desk.placed(BASE, width=512, height=256)
+    assert (measured(large).size, measured(large).measured_size) == ((512, 256), (256, 128))
+    poses = opened.first.poses[1].copy()
+    poses[list(opened.description.geometry.body_names).index("cube"), 2] += 50.0
+    assert measured(poses=poses).wanted_objects(["cube"])[0].pixels[0] == 0
+    with pytest.raises(CannotAnswer):
+        measured(env=2)
+
+
+def test_placements_are_put_back_or_forgotten_and_an_unknown_camera_is_told(desk: Desk) -> None:
+    opened = desk.guarded.opened
+    assert opened is not None
+    there = desk.placed(PEOPLE, position=(0.5, 0.2, 0.7))
+    desk.cameras.place(PlaceCamera(PEOPLE, there))
+    desk.cameras.place(PlaceCamera(("sensor", "gone"), there))
+    desk.cameras.settle()
+    first, second = desk.received()
+    assert (first.key, first.settings, first.why_not) == (PEOPLE, there, "") and first.info.key == PEOPLE
+    assert second.key == ("sensor", "gone") and second.why_not and second.settings == there
+    assert desk.cameras.placed == {PEOPLE: there}
+    desk.cameras.put_back()
+    assert desk.cameras.placed == {PEOPLE: there}
+    desk.cameras.place_now(opened, PlaceCamera(PEOPLE, None))
+    assert desk.cameras.placed == {}
+    desk.cameras.place_now(opened, PlaceCamera(PEOPLE, there))
+    desk.cameras.forget_placed()
+    assert desk.cameras.placed == {}
+
+
+def test_a_placed_camera_is_drawn_again_and_one_that_cannot_be_drawn_is_no_longer_watched(desk: Desk) -> None:
+    desk.cameras.watch(1, (SENSOR, HUMAN))
+    for _ in range(3):
+        desk.iterate()
+    desk.clock.now += 1.0
+    assert desk.wait() is None
+    desk.cameras.failed(CannotDraw("It hangs.", BASE, None))
+    (failed,) = desk.received()
+    assert isinstance(failed, CameraFailed) and failed.key == BASE and "It hangs." in failed.why
+    desk.clock.now += 1.0
+    assert desk.iterate() == [] and shown(desk.iterate()) == [PEOPLE]
+    desk.clock.now += 1.0
+    assert desk.wait() is None
+    desk.cameras.watch(1, (SENSOR, HUMAN))
+    assert desk.wait() is None, "nothing has changed"
+    desk.cameras.watch(0, (SENSOR,))
+    assert desk.wait() == 0.0 and desk.iterate() == []
+    (pictures,) = desk.iterate()
+    assert shown([pictures]) == [BASE] and pictures.pictures[0].env == 0
+    desk.cameras.watch(7, (SENSOR,))
+    assert desk.iterate() == []
+    (pictures,) = desk.iterate()
+    assert pictures.pictures[0].env == 1, "the last one, while the task has fewer envs"

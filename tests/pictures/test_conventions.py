@@ -178,3 +178,78 @@ def test_fov_and_intrinsic_describe_the_same_lens(fov: float, width: int, height
     assert frames.vertical_fov(larger, 3 * height) == pytest.approx(fov)
     assert frames.horizontal_fov(larger, 2 * width) == pytest.approx(frames.horizontal_fov(k, width))
     assert frames.matrix3(k) == tuple(map(tuple, k.tolist()))
+
+
+EYE = np.eye(4)
+LENS = np.array([[100.0, 0, 64], [0, 90, 48], [0, 0, 1]])
+
+
+def changed(matrix: np.ndarray, **numbers: float) -> np.ndarray:
+    """The matrix with these numbers, by row and column: ``r03=1.0``."""
+    matrix = matrix.copy()
+    for place, number in numbers.items():
+        matrix[int(place[1]), int(place[2])] = number
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "says"),
+    [
+        (np.eye(3), "3 x 3"),
+        (changed(EYE, r03=math.nan), "finite"),
+        (changed(EYE, r30=0.5, r33=1.0), "last row"),
+        (changed(EYE, r30=0.5).T * 1.0, None),
+        (changed(EYE, r03=0.5).T, "transposed"),
+        (changed(EYE, r22=-1.0), "mirror"),
+        (changed(EYE, r22=0.0), "determinant is 0"),
+        (changed(EYE, r00=2.0, r11=2.0, r22=2.0), "scales by 2"),
+        (changed(EYE, r01=0.3), "right angles"),
+        (changed(EYE, r00=1.0005), None),
+        (changed(EYE, r00=1.01), "right angles"),
+    ],
+)
+def test_a_matrix_that_is_no_pose_is_refused_with_what_is_wrong(matrix: np.ndarray, says: str | None) -> None:
+    if says is None:
+        frames.pose_from_matrix(matrix, "maniskill", "camera_to_world")
+    else:
+        with pytest.raises(ValueError, match=says):
+            frames.pose_from_matrix(matrix, "maniskill", "camera_to_world")
+
+
+@pytest.mark.parametrize(
+    ("matrix", "valid"),
+    [
+        (LENS, True),
+        (LENS[:2], False),
+        (changed(LENS, r02=math.inf), False),
+        (changed(LENS, r20=0.1), False),
+        (changed(LENS, r10=0.1), False),
+        (changed(LENS, r00=0.0), False),
+        (changed(LENS, r11=-1.0), False),
+        (changed(LENS, r01=0.5), False),
+        (changed(LENS, r01=1e-6), True),
+    ],
+)
+def test_a_lens_that_cannot_be_rendered_is_refused(matrix: np.ndarray, valid: bool) -> None:
+    if valid:
+        assert_allclose(frames.checked_intrinsic(matrix), matrix)
+    else:
+        with pytest.raises(ValueError):
+            frames.checked_intrinsic(matrix)
+
+
+def test_fields_of_view_and_sizes_have_limits_and_a_target_is_ahead() -> None:
+    for fov, width, height in ((0.0, 4, 3), (math.pi, 4, 3), (1.0, 0, 3), (1.0, 4, 0)):
+        with pytest.raises(ValueError):
+            frames.intrinsic_from_fov(fov, width, height)
+    for distance in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError):
+            frames.look_at_of(frames.make_pose((0, 0, 1), (1, 0, 0, 0)), distance)
+    for vector in ((1.0, 2.0), (1.0, 2.0, math.nan)):
+        with pytest.raises(ValueError):
+            frames.make_pose(vector, (1, 0, 0, 0))
+    assert frames.angle_between((1, 0, 0, 0), (-1, 0, 0, 0)) == 0
+    turned = frames.quaternion_from_rpy(0, 0, 30)
+    assert frames.angle_between(turned, -frames.quaternion_from_rpy(0, 0, -40)) == pytest.approx(
+        math.radians(70)
+    )

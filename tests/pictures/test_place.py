@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sapien
+import torch
 from mani_skill.sensors.camera import CameraConfig
 
 from tests.envs.stock_env import batch_of
@@ -19,7 +20,7 @@ from tests.envs.watched import RENDERED, Watched, pictures
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.envs.hot_swap import exchange_cameras
 from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
-from workbench.pictures.placed_cameras import PlacedCameras
+from workbench.pictures.placed_cameras import PlacedCameras, settings_of
 from workbench.pictures.render import list_cameras, segmentation_names, take_pictures
 
 N = 2
@@ -192,6 +193,41 @@ def test_invalid_settings_are_refused_and_change_nothing(env: Any, change: dict,
     with pytest.raises(ValueError, match="there is no human camera"):
         PlacedCameras().place(env, ("human", "beside"), before)
     assert settings_of_camera(env, BESIDE) == before
+
+
+def test_a_camera_whose_lens_differs_between_envs_has_no_settings_and_an_equal_one_has(env: Any) -> None:
+    pose = sapien.Pose([0.1, 0.2, 0.3], [2.0, 0, 0, 0])
+
+    def settings(**lens: Any) -> CameraSettings | None:
+        return settings_of(CameraConfig("eye", pose, 32, 24, near=0.01, far=10, **lens))
+
+    alike = settings(fov=torch.tensor([0.7, 0.7]))
+    assert alike is not None and alike.fov == pytest.approx(0.7) and alike.intrinsic is None
+    assert alike.position == pytest.approx((0.1, 0.2, 0.3)) and alike.quaternion == (1, 0, 0, 0)
+    assert settings(fov=torch.tensor([0.7, 0.8])) is None
+    matrix = np.array(INTRINSIC)
+    by_matrix = settings(intrinsic=np.stack([matrix, matrix]))
+    assert by_matrix is not None and by_matrix.intrinsic == INTRINSIC and by_matrix.fov is None
+    assert settings(intrinsic=np.stack([matrix, 2 * matrix])) is None
+    pose = sapien.Pose([np.nan, 0, 0])
+    assert settings(fov=0.7) is None
+
+
+def test_placements_of_several_cameras_are_kept_apart(env: Any) -> None:
+    placed = PlacedCameras()
+    first, second = (
+        replace(settings_of_camera(env, key), position=(x, 0.1, 1.2))
+        for key, x in ((BESIDE, 0.3), (PEOPLE, 0.6))
+    )
+    placed.place(env, BESIDE, first)
+    placed.place(env, PEOPLE, second)
+    assert placed.all == {BESIDE: first, PEOPLE: second} and placed.settings(BESIDE) == first
+    placed.place(env, BESIDE, None)
+    assert placed.all == {PEOPLE: second} and placed.settings(BESIDE) is None
+    assert settings_of_camera(env, PEOPLE).position == pytest.approx(second.position)
+    assert placed.place(env, BESIDE, None) is False, "it is not placed"
+    placed.forget()
+    assert placed.all == {} and settings_of_camera(env, PEOPLE).position == pytest.approx(second.position)
 
 
 def test_a_pose_that_differs_between_envs_is_flagged_and_restored(env: Any) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from tests.envs.drawn_envs import batched
+from tests.envs.stock_env import batch_of
+from tests.envs.watched import RENDERED, Watched
 from workbench.envs.task_env import TaskEnv
 from workbench.pictures import render as module
 from workbench.pictures.render import list_cameras, recorded_pictures, step_pictures, take_pictures
@@ -15,6 +17,41 @@ from workbench.pictures.render import list_cameras, recorded_pictures, step_pict
 pytestmark = pytest.mark.usefixtures("renderer")
 
 ALL = ("rgb", "depth", "segmentation")
+
+
+def test_each_env_has_its_own_picture_in_the_order_of_the_requests() -> None:
+    task = TaskEnv(batch_of(Watched, 3, **RENDERED))
+    task.reset(seed=[0, 1, 2])
+    cameras = list_cameras(task.env)
+    wanted = recorded_pictures(cameras)
+    assert {(name, kind): tuple(given) for name, kind, given in wanted} == {
+        (camera.name, camera.kind): ALL if camera.kind == "sensor" else ("rgb",) for camera in cameras
+    }
+    only_depth: Any = [
+        ("people", "human", ("rgb",)),
+        ("on_actor", "sensor", ("depth",)),
+        ("beside", "sensor", ALL),
+    ]
+    found = step_pictures(task, [2, 0], only_depth)
+    assert [(one.camera, one.env) for one in found] == [
+        (name, env) for env in (2, 0) for name in ("people", "on_actor", "beside")
+    ]
+    drawn = [one for env in (2, 0) for one in take_pictures(task.env, env, only_depth)]
+    for mine, theirs in zip(found, drawn, strict=True):
+        np.testing.assert_array_equal(mine.pose, theirs.pose)
+        for modality in ALL:
+            seen, wanted_ = getattr(mine, modality), getattr(theirs, modality)
+            if seen is not None and seen.dtype == np.int16 and modality == "depth":
+                seen = seen / np.float32(1000)
+            np.testing.assert_array_equal(seen, wanted_)
+    assert found[1].rgb is None and found[1].depth is not None and found[1].depth.dtype == np.int16
+    assert not np.array_equal(found[0].rgb, found[3].rgb) or not np.array_equal(
+        found[1].depth, found[4].depth
+    )
+    task.obs = {}
+    (rendered,) = step_pictures(task, [1], only_depth[1:2])
+    assert rendered.depth is not None and rendered.depth.dtype == np.float32 and rendered.env == 1
+    task.close()
 
 
 @pytest.mark.slow
