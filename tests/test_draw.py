@@ -197,5 +197,9 @@ def test_the_selected_envs_drawings_are_in_the_view(panels: Panels, on: TaskDraw
     draw.points("dot", position, color="#00ff00")
     shown.draw(on.of_batch(3), 2, offset)
     assert names() == {"dot", "line", "frame", "words"}
+    (dot,) = panels.nodes("/drawn/dot")
+    assert np.asarray(dot.colors).reshape(-1, 3).tolist()[0] == [0, 255, 0]
     shown.draw({}, 2, offset)
     assert not names()
+    shown.draw(on.of_batch(3), 2, offset)
+    assert names() == {"dot", "line", "frame", "words"}, "it was drawn as before, but is no longer there"
