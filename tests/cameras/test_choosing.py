@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +24,7 @@ from workbench.cameras.commands import (
 from workbench.cameras.events import CameraChosen
 from workbench.cameras.studio_panel import NO_CAMERA, TAB
 from workbench.cameras.view import StudioCamera, StudioView
-from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.view import SessionView
 
 BASE, PEOPLE = "base_camera · sensor", "base_camera · human view"
@@ -74,6 +75,23 @@ def test_undo_redo_and_reset_are_offered_when_there_is_something_to_do(live_page
     assert "40 × 3" not in tab.html()
     offered(moved=True, preview_scale=0.5)
     assert "40 × 3" in tab.html()
+
+
+def test_how_long_the_picture_took_is_shown_unless_it_is_a_preview(live_page: Live) -> None:
+    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+    info = replace(camera("base_camera"), settings=at)
+    tab, pose = live_page.part(TAB), np.array([1, 2, 3, 1, 0, 0, 0], np.float32)
+
+    def took(degree: Any = "fast", scale: float = 1.0, **more: Any) -> str:
+        one = StudioCamera(info.key, info, at, False, None)
+        picture = Picture(info.name, info.kind, 0, pose, np.zeros((6, 8, 3), np.uint8), degree=degree)
+        studio = StudioView(cameras=(one,), selected=info.key, preview_scale=scale)
+        live_page.show(running(1, studio=studio, pictures={info.key: picture}, **more))
+        return "".join(re.findall('wb-took">(.*?)<', tab.html("wb-took")))
+
+    assert took(picture_milliseconds=12.4) == "fast, 12 ms"
+    assert took("exact") == "exact", "drawn while steps were made"
+    assert took(scale=0.5, picture_milliseconds=12.4) == "" == took(None)
 
 
 def test_the_buttons_show_what_is_chosen(live_page: Live) -> None:

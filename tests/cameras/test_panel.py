@@ -159,6 +159,7 @@ def test_few_pictures_are_sent_while_no_page_shows_the_tab(panels: Panels, clock
     assert shown() == 40
     panels.do(ShowPictures(kind="sensor", name="base", modality="rgb", on=False))
     assert panel.wanted(view) == (CameraRequest("base", "sensor", ("rgb",)),), "the Studio's"
+    assert panel.wanted(replace(view, preview=True)) == (), "a preview is drawn apart"
     is_shown = False
     assert panel.wanted(view) == ()
 

@@ -25,6 +25,10 @@ def test_the_box_of_an_env_contains_its_bodies_but_not_its_floor() -> None:
     np.testing.assert_allclose(layout.low, [-0.6, -1.2, -0.92], atol=1e-6)
     np.testing.assert_allclose(layout.high, [0.6, 1.2, 0.65], atol=1e-6)
     assert layout.has_floor
+    poses[2, 3, :3] = [0.9, 0.0, 0.02]  # in one env the cube is beside the table
+    np.testing.assert_allclose(lay_out(geometry, poses).high, [0.92, 1.2, 0.65], atol=1e-6)
+    poses[1, 3, :3] = [0.0, -1.5, 0.02]
+    np.testing.assert_allclose(lay_out(geometry, poses).low, [-0.6, -1.52, -0.92], atol=1e-6)
     assert layout.floor_height == pytest.approx(-0.92, abs=1e-3)
 
 
@@ -86,6 +90,9 @@ def test_a_click_selects_the_nearer_of_two_envs_in_a_row() -> None:
     layout = lay_out(geometry, poses)
     front = layout.offsets[0] + [10.0, 0.0, 0.0]
     assert env_under_ray(layout, front, np.array([-1.0, 0.0, 0.0])) == 0
+    behind = front - [20.0, 0.0, 0.0]
+    last = int(np.where(layout.offsets[:, 1] == layout.offsets[0, 1], layout.offsets[:, 0], np.inf).argmin())
+    assert last != 0 and env_under_ray(layout, behind, np.array([1.0, 0.0, 0.0])) == last
 
 
 def test_a_click_between_or_behind_envs_or_with_invalid_numbers_selects_none() -> None:
@@ -173,6 +180,9 @@ def test_the_mark_frames_the_selected_env_at_the_height_of_the_table(panels: Pan
         assert panels.labels() == [f"env {env}"]
     mark.draw(layout, 3, shown=True, name="B")
     assert panels.labels() == ["B"]
+    before = panels.nodes("/selected/frame")[0].points.copy()
+    mark.draw(layout, 0, shown=True, name="B")
+    assert not np.array_equal(panels.nodes("/selected/frame")[0].points, before)
     mark.draw(layout, 3, shown=False)
     assert panels.labels() == [] and panels.nodes("/selected/frame") == []
     mark.draw(layout, 3, shown=True, name="B")
