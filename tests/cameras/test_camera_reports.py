@@ -610,7 +610,8 @@ def test_the_search_box_is_drawn_around_the_eye_in_the_frame_of_the_mount(panels
     folder = CameraSuggest(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     offset = np.array([10.0, -3.0, 0.0], np.float32)
-    mount = make_pose((0.5, 0.2, 0.4), (0, 0, 0, 1)).astype(np.float32)  # turned by half about z
+    half = math.sqrt(0.5)
+    mount = make_pose((0.5, 0.2, 0.4), (half, 0, 0, half)).astype(np.float32)  # turned to the left about z
 
     def corners(one: StudioCamera) -> list[list[float]]:
         session.shown = running(1, studio=StudioView(cameras=(one,), selected=one.key))
@@ -635,7 +636,7 @@ def test_the_search_box_is_drawn_around_the_eye_in_the_frame_of_the_mount(panels
     assert len(lengths) == 12 and (np.sort((lengths > 1e-6).sum(axis=1)) == 1).all(), "along one axis each"
     assert len({tuple(np.round(edge, 4).ravel()) for edge in edges.points}) == 12
     (box,) = corners(camera(mount))
-    x, y, z = 10.5 - 0.3, -2.8, 1.0
+    x, y, z = 10.5, -2.8 + 0.3, 1.0
     np.testing.assert_allclose(box, [x - 0.1, y - 0.1, z - 0.1, x + 0.1, y + 0.1, z + 0.1], atol=1e-5)
     assert corners(replace(camera(mount), mount_pose=None)) == [], "where the mount is not known"
     assert corners(camera()) and (panels.do(ShowSearchBox(on=False)), corners(camera()))[1] == []
@@ -664,6 +665,13 @@ def test_few_links_of_the_robot_are_offered_until_all_are_wanted(panels: Panels)
     assert offered() == {"cube": True, **dict.fromkeys(links[:4], False), "arm/l6": True}
     panels.press("Search")
     assert session.asked[-1].objects == ("cube", "arm/l6") and session.asked[-1].seeds == 8
+    objects = ObjectToSee("cube", False), ObjectToSee("goal", True)
+    assert offered() == {"cube": True}, "a sensor does not see the goal"
+    people = replace(camera(), key=("human", "people"))
+    objects_seen = view_of_camera(cameras=(people,), selected=people.key)
+    assert objects_seen.task is not None
+    folder.draw(replace(objects_seen, task=replace(objects_seen.task, objects=objects)))
+    assert "goal" in panels.html("wb-objects")
 
 
 @dataclass
@@ -731,6 +739,7 @@ def test_the_matrices_follow_camera_mount_convention_and_direction(panels: Panel
     np.testing.assert_allclose(
         extrinsic(moved)[:3, 3], pose_in_env(moved.now or SETTINGS, mount)[:3], atol=1e-8
     )
+    extrinsic(one)
     away = replace(one, mount_pose=make_pose((5, 0, 0), (1, 0, 0, 0)).astype(np.float32))
     np.testing.assert_allclose(extrinsic(away)[:3, 3], np.add((5, 0, 0), SETTINGS.position), atol=1e-6)
 
@@ -783,6 +792,39 @@ def test_an_added_sensor_looks_at_the_objects_with_the_lens_of_its_siblings(pane
     panels.type("New name", "top")
     panels.do(AddCamera(kind="sensor"))
     assert writing.session.asked[-1].request.key == ("sensor", "top")
+
+
+def test_an_added_camera_looks_at_the_middle_of_the_objects_in_all_envs(panels: Panels) -> None:
+    writing = Writing(panels)
+    view = running(3)
+    assert view.task is not None and view.step is not None
+    poses = view.step.poses.copy()
+    poses[:, view.task.geometry.body_names.index("cube"), :3] = [
+        [2.0, 0.1, 0.0],
+        [0.5, 0.1, 0.0],
+        [9.0, 0.1, 0.0],
+    ]
+    task = replace(view.task, objects=(ObjectToSee("cube", False),))
+    view = replace(view, task=task, step=replace(view.step, poses=poses))
+    for position, forward, distance in (
+        ((1.0, 0.1, 0.0), (1, 0, 0, 0), 1.0),
+        ((-2.0, 5.0, 0.0), (1, 0, 0, 0), 4.0),
+        ((2.5, 0.1, 0.0), (1, 0, 0, 0), None),
+    ):
+        part = WriteToFile(
+            panels.server,
+            cast(Any, writing.session),
+            lambda _, lens, position=position, forward=forward: replace(
+                lens, position=position, quaternion=forward
+            ),
+            panels.server.gui.add_folder(None),
+        )
+        writing.session.shown = view
+        part.do(AddCamera(kind="human"), panels.visitor)
+        request = writing.session.asked[-1].request
+        assert request.settings.position == position and request.settings.distance == (
+            None if distance is None else pytest.approx(distance)
+        )
 
 
 @pytest.mark.parametrize(
