@@ -7,13 +7,14 @@ import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from tests.drive.knocking import ask, cookie_of
 from tests.drive.waiting import until
-from workbench.page.door.file_response import BLOCK_BYTES, FileReply
+from workbench.page.door.file_response import BLOCK_BYTES, Downloads, FileReply
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 LARGE_BYTES = 48 * 2**20
@@ -195,3 +196,30 @@ def test_a_damaged_compressed_file_is_cut_off_without_terminal_output(
     assert announced == 6 * BLOCK_BYTES and count < announced
     until(lambda: open_files(path) == 0, "the end of the reading")
     assert caplog.records == []
+
+
+def test_a_file_is_served_only_under_the_address_that_its_page_got(
+    gated_server: GatedServer, tmp_path: Path
+) -> None:
+    downloads = Downloads(gated_server.add_route)
+    one, other = tmp_path / "one.rrd", tmp_path / "größe?.html"
+    one.write_bytes(b"one")
+    other.write_bytes(b"<script>alert(1)</script>")
+    first, second = downloads.address(one), downloads.address(other, "text/html", download=True)
+    assert first == downloads.address(one) != downloads.address(one, "text/plain") and first.endswith(
+        "/one.rrd"
+    )
+    status, headers, body = ask(gated_server, first)
+    assert (status, body, headers["Content-Type"]) == (200, b"one", "application/octet-stream")
+    assert "Content-Disposition" not in headers and "sandbox" in headers["Content-Security-Policy"]
+    status, headers, body = ask(gated_server, second)
+    assert (status, body) == (200, other.read_bytes())
+    assert "attachment" in headers["Content-Disposition"] and "sandbox" in headers["Content-Security-Policy"]
+    routes: list[Any] = []
+    elsewhere = Downloads(lambda *route: routes.append(route)).address(one)
+    for address in (elsewhere, f"/offered/{one}", "/offered/", "/offered/x/one.rrd"):
+        assert ask(gated_server, address)[0] == 404, "nobody can guess an address"
+    one.write_bytes(b"changed")
+    assert ask(gated_server, first)[2] == b"changed"
+    one.unlink()
+    assert ask(gated_server, first)[0] == 404

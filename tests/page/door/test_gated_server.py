@@ -106,6 +106,55 @@ def test_all_interfaces_are_opened_only_with_a_token_and_a_warning(capsys):
         gated_server.close()
 
 
+def test_the_hint_for_ssh_leads_to_the_listening_port(gated_server):
+    port = gated_server.port
+    assert f"-L {port}:127.0.0.1:{port} " in gated_server.ssh_hint
+    assert gated_server.ssh_hint.endswith(f"@{socket.gethostname()}")
+
+
+def test_localhost_is_the_address_that_is_printed_and_listened_on():
+    gated_server = open_server(ServerOptions(host="LocalHost", port=0))
+    try:
+        assert listening_addresses(gated_server.port) == {"127.0.0.1"}
+        assert gated_server.url.startswith(f"http://127.0.0.1:{gated_server.port}/?token=")
+        assert gated_server.warning is None and gated_server.addresses() == (gated_server.url,)
+    finally:
+        gated_server.close()
+
+
+def test_a_route_has_a_prefix_of_its_own_and_a_server_without_a_token_has_none_to_renew(gated_server):
+    for prefix in ("recordings/", "/recordings", "/", "//"):
+        with pytest.raises(ValueError, match="prefix"):
+            gated_server.add_route(prefix, lambda path, query: (200, "text/plain", b"x"))
+    gated_server.add_route("/recordings/", lambda path, query: (200, "text/plain", b"x"))
+    with pytest.raises(ValueError, match="/recordings/"):
+        gated_server.add_route("/recordings/", lambda path, query: (200, "text/plain", b"y"))
+    assert get(gated_server, "/recordings/a")[2] == b"x"
+    open_to_all = open_server(ServerOptions(port=0, token=False))
+    try:
+        assert "token" not in open_to_all.url and get(open_to_all, "/")[0] == 200
+        with pytest.raises(ValueError, match="no token"):
+            open_to_all.renew_token()
+    finally:
+        open_to_all.close()
+
+
+def test_tabs_are_renamed_and_listed_with_their_folds(server: viser.ViserServer) -> None:
+    group = server.gui.add_tab_group()
+    run, cameras = group.add_tab("Run"), group.add_tab("Cameras")
+    with run, server.gui.add_folder("Speed"), server.gui.add_folder("More"):
+        pass
+    server.gui.add_folder("Apart")
+    viser_private.set_tab_label(cameras, "Studio")
+    assert [*viser_private.places(server)] == [
+        ("Run", ""),
+        ("Studio", ""),
+        ("Run", "Speed"),
+        ("Run", "More"),
+        ("", "Apart"),
+    ]
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.7.7", "gpu-server"])
 def test_without_a_token_only_loopback_is_allowed(host):
     with pytest.raises(ValueError, match="token"):

@@ -83,6 +83,7 @@ def test_only_the_owner_can_connect_and_no_port_is_open(before, gated_server, fo
     found = (folder / "page.sock").lstat()
     assert stat.S_ISSOCK(found.st_mode) and stat.S_IMODE(found.st_mode) == 0o600
     assert listening_ports() <= before
+    assert f"-L 8080:{folder.resolve() / 'page.sock'} " in gated_server.ssh_hint
 
 
 def test_the_gate_is_the_same_as_on_a_port(gated_server):
