@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import json
+import math
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from workbench.cameras.calibration_files import (
+    FORMAT,
     CameraToExport,
+    camera_as_ros_yaml,
     camera_pose,
     cameras_as_json,
     cameras_as_opencv_yaml,
@@ -59,6 +65,51 @@ def test_json_holds_every_number_and_survives_a_round_trip() -> None:
         assert_same_pose(camera_pose(found), camera.pose_in_env)
 
 
+def test_every_number_of_the_json_is_that_of_its_camera() -> None:
+    for camera in (FIXED, MOUNTED):
+        (found,) = json.loads(cameras_as_json([camera]))["cameras"]
+        s, pose, k = camera.settings, camera.pose_in_env, frames.intrinsic_of(camera.settings)
+        assert (found["kind"], found["name"], found["width"], found["height"]) == (
+            *camera.key,
+            s.width,
+            s.height,
+        )
+        assert (found["near"], found["far"], found["shader_pack"]) == (s.near, s.far, s.shader_pack)
+        assert_allclose(found["fov_vertical"], 2 * math.atan(s.height / 2 / k[1, 1]))
+        assert_allclose(found["fov_horizontal"], 2 * math.atan(s.width / 2 / k[0, 0]))
+        assert_allclose(found["intrinsic"], k)
+        assert_allclose([*found["position"], *found["quaternion"]], pose)
+        assert_allclose(found["extrinsic_opencv"], frames.opencv_extrinsic(pose))
+        assert_allclose(found["model_matrix_opengl"], frames.opengl_model_matrix(pose))
+        mounted = camera.mount is not None
+        assert (found["position_in_mount"] == [*s.position]) is mounted
+        assert (found["quaternion_in_mount"] == [*s.quaternion]) is mounted
+    with pytest.raises(ValueError, match="panda/panda_hand"):
+        cameras_as_json([replace(MOUNTED, mount_pose=None)])
+
+
+def test_rosyaml_has_the_lens_and_the_pose_of_the_optical_frame() -> None:
+    for camera in (FIXED, MOUNTED):
+        text = camera_as_ros_yaml(camera)
+        found, k = yaml.safe_load(text), frames.intrinsic_of(camera.settings)
+        assert (found["image_width"], found["image_height"]) == (320, 240)
+        assert found["camera_name"] == camera.key[1] and found["distortion_model"] == "plumb_bob"
+        for name, matrix in (
+            ("camera_matrix", k),
+            ("distortion_coefficients", np.zeros((1, 5))),
+            ("rectification_matrix", np.eye(3)),
+            ("projection_matrix", np.hstack([k, np.zeros((3, 1))])),
+        ):
+            given = found[name]
+            assert_allclose(np.reshape(given["data"], (given["rows"], given["cols"])), matrix)
+        numbers = {name: float(number) for name, number in re.findall(r"--(q?[wxyz]) (\S+)", text)}
+        optical = [numbers[name] for name in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+        # The optical frame's axes are right, down and forward.
+        forward, left, up = frames.axes_of(camera.pose_in_env[3:])
+        assert_allclose(frames.axes_of(optical[3:]), [-left, -up, forward], atol=1e-9)
+        assert_allclose(optical[:3], camera.pose_in_env[:3])
+
+
 def test_opencv_reads_its_yaml(tmp_path: Path) -> None:
     path = tmp_path / "cameras.yaml"
     path.write_text(cameras_as_opencv_yaml([FIXED, MOUNTED]))
@@ -71,6 +122,11 @@ def test_opencv_reads_its_yaml(tmp_path: Path) -> None:
             node.getNode("extrinsic").mat(), frames.opencv_extrinsic(camera.pose_in_env), rtol=1e-12
         )
         assert node.getNode("distortion_coefficients").mat().shape == (1, 5)
+        assert_allclose(
+            node.getNode("camera_to_world").mat() @ [*node.getNode("extrinsic").mat(), [0, 0, 0, 1]],
+            np.eye(4),
+            atol=1e-12,
+        )
     storage.release()
     found = {pose.label: pose for pose in find_poses(path.read_text())}
     assert_same_pose(
@@ -124,6 +180,9 @@ def test_a_pasted_matrix_is_read_in_the_chosen_convention(
         '{"calib": [{"R": [[1,0,0],[0,1,0],[0,0,1]], "t": [0, 0, 2]}]}',
         "rotation_matrix: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ntranslation: [0, 0, 2]",
         "rvec: [0, 0, 0]\ntvec: [[0], [0], [2]]",
+        '{"T": [1,0,0,0, 0,1,0,0, 0,0,1,2]}',
+        '{"T": [1,0,0,0, 0,1,0,0, 0,0,1,2, 0,0,0,1], "P": [[1,0,0,9],[0,1,0,9],[0,0,1,9]]}',
+        '{"names": ["a", "b", "c"], "on": [true, false], "T": [["1",0,0,0],[0,1,0,0],[0,0,1,2]]}',
         "%YAML:1.0\nT: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [1.,0,0,0, 0,1.,0,0, 0,1e-12,1.,2.]",
     ],
 )
@@ -143,6 +202,15 @@ def test_many_formats_of_one_pose_are_read(text: str) -> None:
         ("a: " + "[" * 5000, "neither YAML"),
         ("a: &a [*a]", "alias"),
         ("9" * 300_000, "characters"),
+        ("# " + "x" * 25_000 + "\na: 1", "too many for YAML"),
+        ("a: !!opencv-matrix [1, 2]", "rows, cols"),
+        ("1 2 3", "has 3"),
+        ("hello", "neither JSON"),
+        ("rvec: [1, 2]\ntvec: [0, 0, 2]", "no pose"),
+        (
+            json.dumps({"format": FORMAT, "cameras": [7, {"position": [1, 2]}, {"position": [1, 2, 3]}]}),
+            "no pose",
+        ),
     ],
 )
 def test_a_text_without_a_pose_is_refused_with_a_reason(text: str, says: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Awaitable, Callable
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
@@ -78,3 +80,47 @@ def test_a_client_with_nothing_to_read_is_not_deaf() -> None:
         await connection.send("thanks")
 
     assert unsent_bytes(wait) == 0
+
+
+class Checked(Exception):
+    """Every scripted check was made."""
+
+
+def checks_until_closed(sizes: list[int]) -> int | None:
+    """After how many checks a client with these unsent bytes is closed; None if it stays open."""
+    left, aborted = iter(sizes), []
+
+    def unsent() -> int:
+        for size in left:
+            return size
+        raise Checked
+
+    transport = SimpleNamespace(
+        get_write_buffer_size=unsent, get_extra_info=lambda name: None, abort=lambda: aborted.append(1)
+    )
+    connection = cast(ServerConnection, SimpleNamespace(transport=transport))
+    try:
+        asyncio.run(strangers.close_when_stalled(connection, strangers.RateLimitedLog(lambda line: None)))
+    except Checked:
+        return None
+    assert aborted == [1]
+    return len(sizes) - len([*left])
+
+
+@pytest.mark.parametrize(
+    ("sizes", "closed"),
+    [
+        ([0] * 100, None),
+        ([9] * 100, 30),
+        ([*range(1, 101)], 30),
+        ([9 - n // 20 for n in range(100)], None),
+        ([9] * 25 + [0] + [9] * 25, None),
+        ([9] * 25 + [8] + [8] * 40, 55),
+    ],
+)
+def test_only_a_client_that_reads_nothing_for_the_whole_time_is_closed(
+    monkeypatch: pytest.MonkeyPatch, sizes: list[int], closed: int | None
+) -> None:
+    monkeypatch.setattr(strangers, "READ_TIMEOUT_SECONDS", 0.0)
+    found = checks_until_closed(sizes)
+    assert found is None if closed is None else found is not None and abs(found - closed) <= 1

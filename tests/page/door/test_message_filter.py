@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 from websockets.exceptions import ConnectionClosed
@@ -14,6 +16,8 @@ from tests.drive.knocking import CAMERA, Bell, client, close_code, say
 from tests.drive.tabs import messages_in
 from tests.drive.waiting import until
 from workbench.page.door import message_filter
+from workbench.page.door.client_messages import MalformedMessage
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 pytestmark = pytest.mark.thorough
@@ -134,3 +138,57 @@ def test_a_flooding_page_is_throttled_then_disconnected_and_the_others_go_on(
     thread.join()
     bystander()
     flooded.remove()
+
+
+class Paced:
+    """A page's messages under a clock that only waiting moves."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = self.waited = 0.0
+        clock, sleeping = SimpleNamespace(monotonic=lambda: self.now), SimpleNamespace(sleep=self._sleep)
+        monkeypatch.setattr(message_filter, "time", clock)
+        monkeypatch.setattr(message_filter, "asyncio", sleeping)
+        self.guard = message_filter.PageGuard(lambda kind: True, RateLimitedLog(lambda line: None))
+
+    async def _sleep(self, seconds: float) -> None:
+        self.now += seconds
+        self.waited += seconds
+
+    def sends(self, count: int, size: int = 10) -> float:
+        """Send messages at once; the seconds that they had to wait."""
+        before = self.waited
+
+        async def send() -> None:
+            for _ in range(count):
+                await self.guard.wait_turn(size)
+
+        asyncio.run(send())
+        return self.waited - before
+
+
+def test_a_page_is_slowed_only_beyond_a_burst_and_regains_it_in_a_pause(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    page = Paced(monkeypatch)
+    burst, rate = int(message_filter.BURST_MESSAGES), message_filter.MESSAGES_PER_SECOND
+    assert page.sends(burst) == 0
+    assert page.sends(20) == pytest.approx(20 / rate)
+    page.now += 10.0
+    assert page.sends(burst) == 0
+    assert page.sends(20) == pytest.approx(20 / rate), "a longer pause gives no larger burst"
+    page.now += 10.0
+    assert page.sends(100, 3 * message_filter.MESSAGE_BYTES) == 0
+    assert page.sends(1, 3 * message_filter.MESSAGE_BYTES) == pytest.approx(4 / rate), (
+        "a long one counts for more"
+    )
+
+
+def test_a_page_that_never_rests_is_closed_and_one_that_rests_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    page, rate = Paced(monkeypatch), message_filter.MESSAGES_PER_SECOND
+    burst, most = int(message_filter.BURST_MESSAGES), int(message_filter.MAX_SLOWED_SECONDS * rate)
+    for _ in range(5):
+        page.sends(burst + most // 2)
+        page.now += 10.0
+    page.sends(burst + most - 1)
+    with pytest.raises(MalformedMessage):
+        page.sends(3)

@@ -86,6 +86,9 @@ def test_repeated_messages_to_a_distant_page_are_compressed() -> None:
         line = PageConnection(connection)
         for _ in range(10):
             await line.send(same)
+        async with asyncio.timeout(20):
+            while line.unanswered:
+                await asyncio.sleep(0.01)
 
     far, seen = transfer(repeat, delay=0.02)
     assert seen.received == 80_000 and far.down < 20_000

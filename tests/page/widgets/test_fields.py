@@ -69,7 +69,7 @@ def test_a_choice_and_a_tick_send_their_value(panels: Panels) -> None:
         ChooseLensForm,
         "form",
         {"angle": "field of view", "matrix": "intrinsic matrix"},
-        "intrinsic",
+        "intrinsic matrix",
     )
     field = panels.field("Lens")
     assert field.value == "matrix" and field.command("angle") == ChooseLensForm(form="field of view")
