@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from html import unescape
 from typing import Any
 
 import pytest
@@ -14,13 +16,16 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
-from tests.drive.tabs import handshake, tabs_of
+from tests.drive.panels import Panels
+from tests.drive.tabs import Tab, Tabs, handshake, tabs_of
 from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.commands import COMMANDS
 from workbench.live.commands import SetSeed, Step, TogglePlay
 from workbench.live.env_commands import NextEnv, SelectEnv
 from workbench.page.command import Command, Refused
+from workbench.page.commands import ShowTab, ToggleTable
 from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.visitors import PATH, Done, Visitor, Visitors
 
 
@@ -30,6 +35,8 @@ class House:
 
     gated_server: GatedServer
     visitors: Visitors
+    tabs: Tabs
+    opened: list[Tab]
     came: list[tuple[str, Command]] = field(default_factory=list)
     go_on: threading.Event = field(default_factory=threading.Event)
 
@@ -53,21 +60,19 @@ class House:
     def names(self) -> list[str]:
         return [visitor.name for visitor in self.visitors.all()]
 
-    def open(self, page: str) -> Connection:
+    def open(self, page: str, more: str = "") -> Connection:
         address, how = handshake(self.gated_server.url)
         del how["subprotocols"]
-        return connect(f"{address.rstrip('/')}{PATH}?page={page}", proxy=None, **how)
+        return connect(f"{address.rstrip('/')}{PATH}?page={page}{more}", proxy=None, **how)
 
 
 @pytest.fixture
 def house(gated_server: GatedServer) -> Iterator[House]:
     visitors = Visitors(gated_server.server, COMMANDS)
-    house = House(gated_server, visitors)
-    visitors.do = house.do
     gated_server.add_channel(PATH, visitors.serve)
     with tabs_of(gated_server.url) as tabs:
-        tabs.open()
-        tabs.open()
+        house = House(gated_server, visitors, tabs, [tabs.open(), tabs.open()])
+        visitors.do = house.do
         until(lambda: len(house.names()) == 2, "both pages")
         yield house
         house.go_on.set()
@@ -180,6 +185,50 @@ def test_a_client_that_is_not_an_open_page_is_refused(house: House) -> None:
     del how["subprotocols"]
     with pytest.raises(InvalidHandshake):
         connect(f"{address.rstrip('/')}{PATH}?page={house.names()[0]}", proxy=None, **how)
+
+
+def test_a_page_tells_its_width_and_is_gone_once_it_has_closed(house: House) -> None:
+    one, other = house.visitors.all()
+    for more, width in (
+        ("&width=1234", 1234),
+        ("&width=", 0),
+        ("&width=99999", 99999),
+        ("&width=999999", 0),
+        ("&width=-5", 0),
+    ):
+        with house.open(one.name, more) as channel:
+            say(channel, 1, "step")
+            assert reply(channel) == {"n": 1} and (one.page_width, other.page_width) == (width, 0)
+    house.tabs.close(house.opened[0])
+    until(lambda: len(house.names()) == 1, "the end of one page")
+    (left,) = house.names()
+    gone = one.name if left == other.name else other.name
+    with house.open(gone) as channel, pytest.raises(ConnectionClosed):
+        channel.recv(TIMEOUT_SECONDS)
+    with house.open(left) as channel:
+        say(channel, 1, "step")
+        assert reply(channel) == {"n": 1}
+
+
+def test_the_palette_sends_the_commands_of_its_page_and_opens_its_tabs(panels: Panels) -> None:
+    came: list[Command] = []
+    panels.visitors.do = lambda command, visitor: came.append(command)
+    group = panels.server.gui.add_tab_group()
+    with group.add_tab("Run"), panels.server.gui.add_folder("Speed"):
+        pass
+    register(panels.server, panels.visitors, {Step, SelectEnv, ToggleTable}, "live", tabs=("Envs",))
+    assert set(panels.commands()) == {Step.help(), ToggleTable.help(), "Envs tab", "Run tab", "Speed"}
+    for label, command in (
+        (Step.help(), Step()),
+        ("Envs tab", ShowTab(tab="Envs")),
+        ("Run tab", ShowTab(tab="Run")),
+        ("Speed", ShowTab(tab="Run", fold="Speed")),
+    ):
+        panels.command(label)
+        until(lambda: came, "the command")
+        assert came.pop() == command
+    keys = json.loads(unescape(re.findall("data-keys=[\"']([^\"']+)[\"']", panels.html("data-keys"))[0]))
+    assert sorted(keys) == sorted([[Step.key, "live", "step", True], ["b", "page", "toggle_table", False]])
 
 
 def test_each_command_has_a_description_and_a_unique_key() -> None:
