@@ -178,6 +178,10 @@ def test_a_camera_of_the_robot_is_offered_as_text_with_its_mount(file: Path) -> 
         state = refused(task, info, EditRequest("edit", KEY, THERE))
         assert mount in state.snippet and not state.can_copy and "0.25" in state.snippet
         assert "super()" not in state.snippet
+        installed = replace(task, source_files=(), source={})
+        assert not refused(installed, info, EditRequest("edit", KEY, THERE)).can_copy, (
+            "the copy would not hold it"
+        )
 
 
 def test_a_copy_of_a_task_gets_a_free_name_and_the_original_stays(file: Path, tmp_path: Path) -> None:
