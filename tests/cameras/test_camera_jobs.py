@@ -244,6 +244,7 @@ def test_a_probed_pixel_is_the_one_under_the_pointer_and_its_point_is_where_it_w
     assert (picked.pixel, picked.body, picked.depth, picked.env) == ((6, 4), "cube", 2.0, 2)
     # OpenCV: right and down of the pixel's centre, from the optical centre.
     right, down = (6.5 - 3) / 100 * 2, (4.5 - 2) / 50 * 2
+    assert picked.point is not None
     np.testing.assert_allclose(picked.point, compose(pose, [2, -right, -down, 1, 0, 0, 0])[:3], atol=1e-5)
     beside = pick_pixel(info, picture, 5.9 / 8, 4.7 / 6, {9: "cube"})
     assert (beside.pixel, beside.body, beside.depth, beside.point) == ((5, 4), None, None, None)

@@ -385,7 +385,7 @@ def report_of(
         rows[:, place] = pixels
     share = np.linspace(0.2, 0.4, len(envs)).astype(np.float32)
     near, far = (np.full(len(envs), metres, np.float32) for metres in (0.4, 1.5))
-    depth = DepthReport(rows, share, share / 2, near, far)
+    depth = DepthReport(rows, share, share * np.float32(0.5), near, far)
     return CameraReport(KEY, (128, 128), (64, 64), envs, objects, depth, 7, 100.0)
 
 
@@ -573,7 +573,8 @@ def test_a_comparison_is_shown_with_its_differences_until_another_camera_is_chos
     html(SETTINGS)
     assert not panels.shows("Return to A"), "it is there"
     assert html(moved) and panels.shows("Return to A")
-    other = StudioResults(compared=(picture(2, key=("human", "base_camera")),) * 2)
+    people = picture(2, key=("human", "base_camera"))
+    other = StudioResults(compared=(people, people))
     folder.draw(view_of_camera(moved, results=other))
     assert panels.html("wb-pair") == ""
 

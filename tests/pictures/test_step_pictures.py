@@ -1,5 +1,8 @@
 """Pictures taken from the observation equal those that would be rendered."""
 
+# A sensor has colours and depth.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from typing import Any

@@ -1,5 +1,8 @@
 """Small texts of the page: sizes, shares, letters, keys, and the names of commands."""
 
+# A `SimpleNamespace` has any attribute.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from types import SimpleNamespace
