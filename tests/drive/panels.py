@@ -18,12 +18,13 @@ from typing import Any, Literal
 import numpy as np
 import viser
 from markupsafe import escape
+from numpy.typing import NDArray
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 
 from tests.drive.charts import Chart, charts_in
 from tests.drive.own_controls import Controls, SeenButton, SeenField
 from workbench.commands import COMMANDS
-from workbench.machine.loop import result_of
+from workbench.machine.loop import do, result_of
 from workbench.page.command import Command, Refused
 from workbench.page.door.gated_server import GatedServer
 from workbench.page.widgets.parts import Parts
@@ -57,10 +58,20 @@ class Client:
 
     client_id: int = 1
     notices: list[str] = field(default_factory=list)
+    sent: list[str] = field(default_factory=list)
+    """HTML that was sent to this page alone."""
     camera: Any = field(default_factory=lambda: SimpleNamespace(wxyz=(1.0, 0.0, 0.0, 0.0)))
 
     def add_notification(self, title: str, body: str, **_: object) -> None:
         self.notices.append(body)
+
+    @property
+    def gui(self) -> Any:
+        return SimpleNamespace(add_html=self._add_html)
+
+    def _add_html(self, html: str) -> Any:
+        self.sent.append(html)
+        return SimpleNamespace(remove=lambda: None)
 
 
 class _Threads:
@@ -328,6 +339,14 @@ class Panels:
         uuid, handle = self._commands()[label]
         assert not handle.disabled, f"{label} is greyed"
         self._handled(self.server.gui._handle_command_trigger, CommandTriggerMessage(uuid))
+
+    def click_view(self, origin: NDArray, direction: NDArray) -> None:
+        """Click into the 3-D view: a ray from `origin` (3,) along `direction` (3,)."""
+        ray: Any = tuple(origin.tolist()), tuple(direction.tolist())
+        event = viser.SceneClickEvent(self.client, self.client.client_id, *ray, (0.5, 0.5), None)  # type: ignore[arg-type]
+        for entry in list(self.server.scene._scene_pointer_cb):
+            asyncio.run(entry.callback(event))  # type: ignore[arg-type]
+        do(lambda: None)  # the page handles the click on its loop
 
     def settle(self) -> None:
         """Wait until viser's event loop and the jobs that it started are done."""

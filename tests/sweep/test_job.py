@@ -14,9 +14,20 @@ from workbench.cli.sweep import parse_settings
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.scheduler import Executor
+from workbench.planning.options import PlanOptions
 from workbench.record.job import RecordProgress
-from workbench.sweep.job import Setting, SweepOptions, SweepReport, recordings_of, sweep
+from workbench.record.job_worker import Written
+from workbench.sweep.job import (
+    MAX_POINTS,
+    Setting,
+    SweepOptions,
+    SweepReport,
+    collect_sweep,
+    recordings_of,
+    sweep,
+)
 from workbench.task.description import TaskOptions
+from workbench.task.settings_in_text import SettingError
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -56,6 +67,7 @@ def test_each_seed_is_recorded_once_for_each_point(swept: SweepReport, out: Path
     rows = swept.results.episodes
     assert [(row.point, row.seed) for row in rows] == [(p, s) for p in range(4) for s in (5, 6, 7)]
     assert swept.missing == 0 and not swept.stopped
+    assert [failure.numbers for failure in swept.failures]
     recorded = [row for row in rows if row.recording]
     assert [row.point for row in recorded] == [0, 0, 0, 2, 2, 2]
     for row in recorded:
@@ -197,6 +209,83 @@ def test_a_constructor_argument_is_passed_to_the_env(several: Path) -> None:
     assert changed(several, "Swept.__init__.weight=2") == ({"weight": 2}, "", "")
 
 
+def test_every_option_reaches_the_recording_of_each_point(several: Path) -> None:
+    made = replace(options(several.parent, "Swept.GAIN=1,2", "tall=true,false", seeds=7), pictures=True)
+    made = replace(made, actions="solve", plan=PlanOptions(rollouts=17), upload="s3://bucket/x/")
+    recordings = recordings_of(replace(made, task=str(several)))
+    assert [one.out for one in recordings] == [several.parent / point.folder for point in made.points]
+    assert len({one.out for one in recordings}) == 4
+    for point, one in zip(made.points, recordings, strict=True):
+        assert (one.episodes, one.max_steps, one.actions, one.plan.rollouts) == (7, 3, "solve", 17)
+        assert one.pictures and one.after_success > 0 and one.upload == f"s3://bucket/x/{point.folder}"
+        assert one.options == replace(made.options, env_kwargs={**PLAIN, "tall": point.values["tall"]})
+        assert list(one.source.values()) == [
+            SEVERAL.replace("0.5  # of", f"{point.values['Swept.GAIN']}.0  # of")
+        ]
+    plain = recordings_of(replace(made, task=str(several), actions="random", upload="", pictures=False))
+    assert [(one.after_success, one.upload, one.pictures) for one in plain] == [(0, "", False)] * 4
+
+
+def test_an_id_of_maniskill_takes_arguments_of_its_constructor(tmp_path: Path) -> None:
+    (one,) = recordings_of(replace(options(tmp_path, "robot_uids=fetch"), task="PickCube-v1"))
+    assert one.options.env_kwargs == {**PLAIN, "robot_uids": "fetch"} and one.source == {}
+    for setting in ("robot_uidss=fetch", "SIZE=1"):
+        with pytest.raises(SettingError):
+            recordings_of(replace(options(tmp_path, setting), task="PickCube-v1"))
+    # Registered by a module of --import, which is not imported here: its arguments are unknown.
+    (one,) = recordings_of(replace(options(tmp_path, "anything=1"), task="Unknown-v1"))
+    assert one.options.env_kwargs["anything"] == 1
+
+
+def test_a_request_that_makes_no_sense_is_refused(several: Path) -> None:
+    def refused(error: type[Exception] = ValueError, *given: str, **changes: object) -> None:
+        what = replace(options(several.parent, *(given or ("tall=true",))), task=str(several))
+        recordings_of(what)
+        with pytest.raises(error):
+            recordings_of(replace(what, **changes))
+
+    refused(seeds=0)
+    refused(settings=(Setting("Swept.GAIN", (1.0,) * (MAX_POINTS + 1)),))
+    refused(SettingError, options=TaskOptions(env_kwargs={"tall": False}))
+    (several.parent / "given.npy").touch()
+    refused(actions=str(several.parent / "given.npy"))
+    recordings_of(replace(options(several.parent, "Swept.GAIN=1"), task=str(several), options=TaskOptions(env_kwargs={"tall": False})))  # fmt: skip
+
+
+def test_results_have_the_seed_and_the_point_of_each_episode(several: Path) -> None:
+    what = replace(options(several.parent, "Swept.GAIN=1,2", seeds=3, num_envs=4), task=str(several))
+    assert what.chunk == what.stride == 4
+    known: dict[int, Written | None] = {}
+    for number, success, solved_at in ((0, True, 2), (2, False, 1), (4, None, None), (5, False, None)):
+        path = several.parent / f"e{number}.rrd"
+        known[number] = Written(number, path, 0, 9, float(number), success, solved_at=solved_at, means={"a": number})  # fmt: skip
+    known[6] = None
+    report = collect_sweep(what, known)
+    rows = {(row.point, row.seed): row for row in report.results.episodes}
+    assert list(rows) == [(0, 5), (0, 7), (1, 5), (1, 6), (1, 7)]
+    first, second = (point.folder for point in what.points)
+    found = [(row.success, row.success_at_end, row.solved_at, row.total_reward) for row in rows.values()]
+    assert found == [
+        (True, True, 2, 0.0),
+        (True, False, 1, 2.0),
+        (None, None, None, 4.0),
+        (False, False, None, 5.0),
+        (None, None, None, None),
+    ]
+    recordings = [row.recording for row in rows.values()]
+    assert recordings == [f"{first}/e0.rrd", f"{first}/e2.rrd", f"{second}/e4.rrd", f"{second}/e5.rrd", ""]
+    assert [(row.steps, row.means) for row in rows.values()][:2] == [(9, {"a": 0}), (9, {"a": 2})]
+    assert report.missing == 1 and not report.stopped and report.failures == ()
+
+
+def test_folders_of_points_are_distinct_short_and_sorted_like_the_points(tmp_path: Path) -> None:
+    values = tuple(f"{'x' * 90}/../ {k}" for k in range(12))
+    points = replace(options(tmp_path, "a=1"), settings=(Setting("C.a", values),)).points
+    folders = [point.folder for point in points]
+    assert sorted(folders) == folders and len(set(folders)) == 12
+    assert all(len(folder) < 90 and "/" not in folder and " " not in folder for folder in folders)
+
+
 @pytest.mark.parametrize(
     ("given", "why"),
     [
@@ -240,3 +329,5 @@ def test_chunks_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     assert what.stride == 104 and len(what.items) == 300 and what.items[100] == 104
     many = replace(what, settings=(Setting("MOST", tuple(range(200))),))
     assert many.chunk == 100, "with many points, a chunk is a whole point"
+    some = replace(what, settings=(Setting("MOST", tuple(range(40))),))
+    assert some.chunk == 64, "about 64 chunks of all envs"

@@ -17,7 +17,13 @@ from tests.drive.episodes import made
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from tests.episodes.sweep_files import sweep_folder
-from workbench.episodes.sweep_results import RESULTS, SweepEpisode, SweepResults, write_results
+from workbench.episodes.sweep_results import (
+    RESULTS,
+    PointSummary,
+    SweepEpisode,
+    SweepResults,
+    write_results,
+)
 from workbench.library.folder import Library
 from workbench.page.command import Command, name_of
 from workbench.review.commands import (
@@ -30,7 +36,7 @@ from workbench.review.commands import (
 )
 from workbench.review.view import Opened, ReviewView
 from workbench.sweep import panel as sweep
-from workbench.sweep.panel import SweepPanel, best_first
+from workbench.sweep.panel import BOTTOM, MAX_AXES, TOP, Shown, SweepPanel, apply, axes_of, best_first
 
 
 class Tab:
@@ -225,3 +231,112 @@ def test_earlier_success_ranks_first_then_higher_return() -> None:
         SweepEpisode(0, 4, failure="no"),
     ]
     assert [row.seed for row in best_first(rows)] == [2, 3, 1, 0]
+
+
+# --- axes and choices --------------------------------------------------------------------------------
+
+
+def summary(index: int, total: float | None, solved: int | None = None, **values: object) -> PointSummary:
+    means = {} if total is None else {"reward_terms/reach": 10 * total, "height": 1.0}
+    texts = {name: json.dumps(value) for name, value in values.items()}
+    return PointSummary(index, texts, 0 if total is None else 4, solved, solved, total, means, 0, "")
+
+
+def axes(*points: PointSummary) -> dict[str, list[float | None]]:
+    """Height of each point on each axis, as a share from the bottom."""
+    results = SweepResults("push.py", "zero", 4, tuple(dict(one.values) for one in points), ())
+    return {
+        axis.name: [None if y is None else round((BOTTOM - y) / (BOTTOM - TOP), 3) for y in axis.heights]
+        for axis in axes_of(results, points)
+    }
+
+
+def ticks(name: str, *points: PointSummary) -> list[str]:
+    results = SweepResults("push.py", "zero", 4, tuple(dict(one.values) for one in points), ())
+    (axis,) = (axis for axis in axes_of(results, points) if axis.name == name)
+    assert [y for _, y, _ in axis.ticks] == sorted((y for _, y, _ in axis.ticks), reverse=True)
+    return [label for label, _, _ in axis.ticks]
+
+
+def test_each_point_is_drawn_at_its_values_and_results() -> None:
+    points = [
+        summary(0, 8.0, 1, weight=10, robot="panda"),
+        summary(1, 2.0, 4, weight=9, robot="fetch"),
+        summary(2, None, weight=100, robot="panda"),
+    ]
+    assert axes(*points) == {
+        "weight": [0.5, 0.0, 1.0],  # by size, not by text
+        "robot": [1.0, 0.0, 1.0],
+        "success": [0.25, 1.0, None],
+        "return": [1.0, 0.0, None],
+        "reach": [1.0, 0.0, None],
+    }
+    assert ticks("weight", *points) == ["9", "10", "100"] and ticks("robot", *points) == ["fetch", "panda"]
+    assert ticks("success", *points) == ["0 %", "100 %"] and ticks("return", *points) == ["2", "8"]
+    assert ticks("reach", *points) == ["20", "80"]
+    mixed = [summary(0, 1.0, a="x"), summary(1, 1.0, a=3)]
+    assert axes(*mixed) == {"a": [1.0, 0.0], "return": [0.5, 0.5], "reach": [0.5, 0.5]}
+    assert ticks("a", *mixed) == ["3", "x"], "numbers first" and ticks("return", *mixed) == ["1"]
+
+
+def test_many_values_and_terms_leave_room_for_what_was_set() -> None:
+    many = [summary(k, float(k), a=k) for k in range(20)]
+    assert ticks("a", *many) == ["0", "3", "5", "8", "11", "14", "16", "19"]
+    terms = {f"reward_terms/{k}": 1.0 for k in range(20)}
+    assert len(axes(*(replace(one, means=terms) for one in many))) == MAX_AXES
+    set_names = {f"s{k}": 1 for k in range(12)}
+    assert list(axes(summary(0, 1.0, 1, **set_names))) == [*set_names, "success", "return"]
+    named = replace(summary(0, 1.0, a=1), means={"success": 5.0})
+    assert ticks("success", named, replace(named, index=1, means={"success": 9.0})) == ["5", "9"], (
+        "not a rate"
+    )
+
+
+def test_a_press_changes_the_choice_that_it_is_about() -> None:
+    points = [summary(k, float(k), a=k % 3, b=k % 2) for k in range(30)]
+    first = Shown()
+    by_a = apply(first, SortSweep(column="set a"), points)
+    assert (by_a.column, by_a.descending) == ("set a", False)
+    assert apply(by_a, SortSweep(column="set a"), points).descending
+    assert apply(by_a, SortSweep(column="return"), points).descending, "the best first"
+    only = first
+    for name, value, kept in (("a", "1", 10), ("a", "2", 20), ("b", "0", 10), ("a", "1", 5)):
+        only = apply(only, FilterSweep(name=name, value=value), points)
+        assert sum(map(only.keeps, points)) == kept
+    turned = apply(only, TurnSweep(by=1), points)
+    assert turned.pages.places(5).start == 0, "five points are one page"
+    assert apply(first, TurnSweep(by=1), points).pages.places(30).start == 12
+    assert all(map(apply(only, ClearSweepFilter(), points).keeps, points))
+    assert apply(first, ShowSweepPoint(index=7), points).chosen == 7
+
+
+def test_a_row_has_the_results_of_its_point_and_each_column_sorts_by_its_own(tab: Tab) -> None:
+    def rows() -> list[list[str]]:
+        table = re.findall(r"<tr data-do.*?</tr>", tab.panels.html("wb-sweep-scroll"), re.DOTALL)
+        return [[re.sub("<[^>]*>", "", cell) for cell in re.findall(r"<td.*?</td>", row)] for row in table]
+
+    assert rows()[0] == ["2", "panda", "83 % (55 - 95)", "83 %", "29", "0.275", "2", "12"]
+    assert rows()[-1] == ["2", "nix", "12 failed", "", "", "", "", "0"]
+    for column, at in (("success", 2), ("at the end", 3), ("return", 4), ("mean reward_terms/push", 6)):
+        tab.ask(SortSweep(column=column))
+        if rows()[0][1] == "nix":
+            tab.ask(SortSweep(column=column))
+        numbers = [float(row[at].split()[0]) for row in rows() if row[1] != "nix"]
+        assert len(numbers) == 6 and numbers == sorted(numbers, reverse=True), column
+    tab.ask(SortSweep(column="episodes"))
+    assert [row[-1] for row in rows()] == ["12"] * 6 + ["0"] * 3
+    html = tab.panels.html("wb-parallel")
+    assert html.count("wb-failed") == 3 and html.count(' wb-chosen"') == 1
+    (chosen,) = re.findall(r'<polyline points="[^"]*" class="wb-point wb-chosen" style="--part:(\d+)%', html)
+    assert chosen == "83"
+
+
+def test_the_open_episode_is_marked(tab: Tab) -> None:
+    tab.view = ReviewView(opened=(opened("p6s03"),))
+    tab.draw()
+    marked = re.findall(r'<tr[^>]*class="wb-chosen">.*?</tr>', tab.panels.html("wb-sweep-episodes"))
+    assert len(marked) == 1 and "seed 3<" in marked[0] and "solved at 13" in marked[0] and ">34<" in marked[0]
+    key = tab.panel.key(tab.view)
+    assert tab.panel.key(ReviewView()) != key
+    tab.ask(ShowSweepPoint(index=1))
+    assert tab.panel.key(tab.view) != key
