@@ -36,7 +36,7 @@ from workbench.review.commands import (
 )
 from workbench.review.view import Opened, ReviewView
 from workbench.sweep import panel as sweep
-from workbench.sweep.panel import BOTTOM, MAX_AXES, TOP, Shown, SweepPanel, apply, axes_of, best_first
+from workbench.sweep.panel import BOTTOM, MAX_AXES, TOP, WIDTH, Shown, SweepPanel, apply, axes_of, best_first
 
 
 class Tab:
@@ -245,6 +245,8 @@ def summary(index: int, total: float | None, solved: int | None = None, **values
 def axes(*points: PointSummary) -> dict[str, list[float | None]]:
     """Height of each point on each axis, as a share from the bottom."""
     results = SweepResults("push.py", "zero", 4, tuple(dict(one.values) for one in points), ())
+    places = [axis.x for axis in axes_of(results, points)]
+    assert places == sorted(set(places)) and 0 < places[0] and places[-1] < WIDTH
     return {
         axis.name: [None if y is None else round((BOTTOM - y) / (BOTTOM - TOP), 3) for y in axis.heights]
         for axis in axes_of(results, points)

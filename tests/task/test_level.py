@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import textwrap
+import types
 from pathlib import Path
 
 import pytest
+from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.task.reload_level import Change, Inherited, find_change, removed_effects
+from workbench.task.reload_level import Change, Inherited, find_change, inherited_names, removed_effects
 
 FILE = "/author/task.py"
 PUSH_CUBE = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
@@ -329,3 +333,265 @@ def test_an_import_side_effect_missing_in_the_new_version_is_reported_at_its_lin
     line = base.count("\n") + 2
     assert removed(old, base) == (f"task.py:{line} ({statement.splitlines()[0]})" if has_one else "")
     assert removed(base, old) == removed(old, f"import re\n{old}") == removed(old, old) == ""
+
+
+BESIDE = "def made():\n    return 1\n"
+
+
+def levels_of(rows: str, **beside: str) -> dict[str, str]:
+    """The level of changing ``NN`` from 1 to 2 in each row's code, by the row: code of methods, or of the file above
+    ``|``. In a row, ``;;`` ends a line and ``>`` begins a deeper one."""
+    found: dict[str, str] = {}
+    for row in filter(None, map(str.strip, rows.strip().splitlines())):
+        top, _, methods = row.rpartition("|")
+        texts = [
+            task(
+                *(
+                    re.sub("(?<=;;)>+", lambda deep: "    " * len(deep[0]), part)
+                    .replace(";;", "\n")
+                    .replace("NN", n)
+                    for part in (methods, top)
+                )
+            )
+            for n in "12"
+        ]
+        found[row] = change(texts[0], texts[1], **beside).level
+    return found
+
+
+def test_a_write_that_later_calls_may_skip_rebuilds() -> None:
+    ev = "def evaluate(self):"
+    found = levels_of(
+        f"""
+        {ev};;>if self.f:;;>>self.w = NN
+        {ev};;>while self.f:;;>>self.w = NN
+        {ev};;>try:;;>>pass;;>except KeyError:;;>>self.w = NN
+        {ev};;>try:;;>>self.w = NN;;>finally:;;>>pass
+        {ev};;>match self.f:;;>>case 1:;;>>>self.w = NN
+        {ev};;>for i in range(3):;;>>if i:;;>>>break;;>self.w = NN
+        {ev};;>if self.f:;;>>raise ValueError;;>self.w = NN
+        {ev};;>def inner():;;>>self.w = NN;;>return inner()
+        {ev};;>del self.w;;>return NN
+        {ev};;>if self.f:;;>>a, self.w = 1, NN
+        {ev};;>if self.f:;;>>a, *self.w = 1, NN
+        {ev};;>if self.f:;;>>for self.w in (1, NN):;;>>>pass
+        {ev};;>if self.f:;;>>with open("x") as self.w:;;>>>return NN
+        {ev};;>if self.f:;;>>self.w: int = NN
+        {ev};;>if self.f:;;>>self.w += NN
+        {ev};;>if self.f:;;>>self.w.add_(NN)
+        {ev};;>if self.f:;;>>self.rows[0].append(NN)
+        {ev};;>if self.f:;;>>torch.add(self.w, NN, out=self.w)
+        {ev};;>if self.f:;;>>self.kept.update(a=NN)
+        {ev};;>self.f and self.kept.append(NN)
+        {ev};;>self.w = NN if self.f else 0
+        {ev};;>yield NN
+        {ev};;>return getattr(self, "w", NN)
+        {ev};;>setattr(self, "w", NN)
+        {ev};;>both = dict(a=self.kept);;>if self.f:;;>>both["a"]["x"] = NN
+        {ev};;>mine = self.kept;;>if self.f:;;>>mine[0] = NN
+        {ev};;>for mine in self.kept:;;>>if self.f:;;>>>mine[0] = NN
+        {ev};;>with self.kept as mine:;;>>if self.f:;;>>>mine[0] = NN
+        {ev};;>mine, k = self.kept;;>if self.f:;;>>mine[0] = NN
+        {ev};;>mine: list = self.kept;;>if self.f:;;>>mine[0] = NN
+        from beside import made|{ev};;>mine = made();;>if self.f:;;>>mine[0] = NN
+        import beside|{ev};;>mine = beside.made();;>if self.f:;;>>mine[0] = NN
+        from . import beside|{ev};;>mine = beside.made();;>if self.f:;;>>mine[0] = NN
+        def made():;;>return 1|def evaluate(self, k=made()):;;>return NN
+        def _initialize_episode(self, env_idx, options):;;>if options.get("all"):;;>>print(NN)
+        def _initialize_episode(self, env_idx, options):;;>if self.reconfigures:;;>>print(NN)
+        """,
+        beside=BESIDE,
+    )
+    assert {row: level for row, level in found.items() if level != "rebuilt"} == {} and len(found) == 36
+
+
+def test_a_write_in_every_call_or_to_a_new_value_is_patched() -> None:
+    ev = "def evaluate(self):"
+    found = levels_of(
+        f"""
+        {ev};;>self.w = NN
+        {ev};;>with torch.no_grad():;;>>self.w = NN
+        {ev};;>for i in range(3):;;>>self.w = NN
+        {ev};;>self.w.add_(NN);;>return self.w
+        {ev};;>self.w[self.rows] = NN
+        {ev};;>if self.f:;;>>w = NN;;>>return w
+        {ev};;>return getattr(self, "w") + NN
+        {ev};;>mine = self.kept.clone();;>if self.f:;;>>mine[0] = NN
+        {ev};;>mine = np.zeros(3);;>if self.f:;;>>mine[0] = NN
+        {ev};;>mine = [1, 2];;>if self.f:;;>>mine.append(NN)
+        {ev};;>mine: list = [];;>if self.f:;;>>mine.append(NN)
+        def evaluate(self, k=torch.zeros(1)):;;>return k + NN
+        def compute_dense_reward(self, obs, action, info):;;>if self.f:;;>>info["w"] = NN
+        @property;;def far(self):;;>return NN;;{ev};;>return self.far
+        @staticmethod;;def far():;;>return NN;;{ev};;>return self.far()
+        def _initialize_episode(self, env_idx, options):;;>if len(env_idx) > 3:;;>>print(NN)
+        """,
+        beside=BESIDE,
+    )
+    assert {row: level for row, level in found.items() if level != "patched"} == {} and len(found) == 16
+
+
+def test_a_value_of_the_file_that_may_change_while_the_task_runs_rebuilds() -> None:
+    ev = "def evaluate(self):"
+    changes = levels_of(
+        f"""
+        KEPT = []|{ev};;>note(KEPT, NN)
+        KEPT = {{}}|{ev};;>return {{"a": KEPT, "n": NN}}
+        KEPT = []|{ev};;>self.mine = KEPT;;>return NN
+        KEPT = [];;ALSO = KEPT|{ev};;>note(ALSO, NN)
+        KEPT = dict()|{ev};;>note(x=KEPT, n=NN)
+        KEPT = iter([1, 2])|{ev};;>return KEPT(NN)
+        KEPT = [1]|{ev};;>del KEPT[0];;>return NN
+        KEPT = {{1: 2}}|{ev};;>KEPT.setdefault(NN, 1)
+        KEPT = {{1: 2}}|{ev};;>KEPT[1] += NN
+        KEPT = (1, [])|{ev};;>note(KEPT, NN)
+        KEPT = torch.zeros(3)|{ev};;>KEPT.add_(NN)
+        KEPT = [i for i in range(3)]|{ev};;>KEPT.append(NN)
+        {ev};;>Task.count = NN;;count = 0
+        rows = [1];;{ev};;>self.rows.append(NN)
+        rows = [1];;{ev};;>self.rows[0] = NN
+        """
+    )
+    assert {row: level for row, level in changes.items() if level != "rebuilt"} == {} and len(changes) == 15
+    stays = levels_of(
+        f"""
+        KEPT = [];;SIZE = len(KEPT)|{ev};;>return len(KEPT) + NN
+        KEPT = [1, 2]|{ev};;>note(KEPT, NN)
+        KEPT = [1, 2]|{ev};;>return KEPT[0] + NN
+        KEPT = (1, 2)|{ev};;>return KEPT.index(NN)
+        KEPT = []|{ev};;>return torch.tensor(KEPT) + NN
+        KEPT = 3;;ALSO = KEPT|{ev};;>note(ALSO, NN)
+        KEPT = np.pi|{ev};;>note(KEPT, NN)
+        count = 0;;{ev};;>self.count = NN
+        """
+    )
+    assert {row: level for row, level in stays.items() if level != "patched"} == {} and len(stays) == 8
+
+
+@pytest.mark.parametrize(
+    ("row", "level"),
+    [
+        # Other tasks of the file have no live env.
+        ("class Other(BaseEnv):;;>def _load_scene(self, options):;;>>return NN|x = 1", "patched"),
+        ("class Other(BaseEnv):;;>x = 1;;class More(Other):;;>def _load_scene(self, options):;;>>return NN|x = 1", "patched"),
+        ("class Helper:;;>def size(self):;;>>return NN|def evaluate(self):;;>return {}", "rebuilt"),
+        ("def size():;;>return NN|def evaluate(self):;;>return size()", "patched"),
+        ("@note;;def size():;;>return NN|def evaluate(self):;;>return size()", "rebuilt"),
+        ("compute_dense_reward = NN", "rebuilt"),
+        ("_default_sensor_configs = [NN]", "rebuilt"),
+        ("def __enter__(self):;;>return NN", "rebuilt"),
+        ("def step(self, action):;;>return NN", "rebuilt"),
+        ("def mine(self):;;>return NN", "patched"),
+        ("def _before_control_step(self):;;>self.w = NN", "patched"),
+        ("def __init__(self):;;>super().__init__();;>self.w = 1;;def evaluate(self):;;>return NN", "patched"),
+        ("def __init__(self):;;>super().__init__();;>note();;def evaluate(self):;;>return NN", "rebuilt"),
+        ("def __init__(self):;;>x = super().__init__();;def evaluate(self):;;>return NN", "rebuilt"),
+        ("def __init__(self):;;>note();;>super().__init__();;def evaluate(self):;;>return NN", "patched"),
+        # What another name leads to.
+        ("def size():;;>return NN|def _load_scene(self, options):;;>getattr(self, 'size')", "rebuilt"),
+        ("def size():;;>return NN|def _load_scene(self, options):;;>note('here.size')", "rebuilt"),
+        ("SIZE = NN|def _load_scene(self, options: SIZE) -> SIZE:;;>pass", "patched"),
+        ("SIZE = NN;;if note():;;>SIZE = 3|def evaluate(self):;;>return SIZE", "rebuilt"),
+        ("import threading|def evaluate(self):;;>return NN", "patched"),
+        ("def far():;;>import threading;;>return NN|def evaluate(self):;;>return far()", "rebuilt"),
+        ("def evaluate(self):;;>return type('T', (), {}) or NN", "rebuilt"),
+        ("def evaluate(self):;;>return type(self).__name__ + 'NN'", "patched"),
+        ("if __name__ == '__main__':;;>note(NN)|x = 1", "same"),
+        ("if __name__ == '__main__':;;>note(NN);;else:;;>note(3)|x = 1", "rebuilt"),
+        ("note(NN)|x = 1", "rebuilt"),
+        ("def evaluate(self):;;>'''NN'''", "same"),
+        ("def evaluate(self):;;>'''NN''';;>return self.evaluate.__doc__", "patched"),
+        # Cameras.
+        ("@property;;def _default_sensor_configs(self):;;>return [NN];;def evaluate(self):;;>return self._sensors", "rebuilt"),
+        ("@property;;def _default_sensor_configs(self):;;>return [self.near];;@property;;def near(self):;;>return NN", "cameras"),
+        ("@property;;def _default_sensor_configs(self):;;>return [NN];;def evaluate(self):;;>return torch.rand(1)", "cameras"),
+    ],
+)  # fmt: skip
+def test_what_may_have_built_the_env_decides_the_level(row: str, level: str) -> None:
+    assert levels_of(row) == {row: level}
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["(BaseEnv, metaclass=Meta)", "(BaseEnv)", "[T](BaseEnv)"][:2],
+)
+def test_a_class_that_is_made_unusually_rebuilds(head: str) -> None:
+    def text(n: int, decorator: str = "") -> str:
+        return f"class Meta(type): pass\n{decorator}class Task{head}:\n    def evaluate(self):\n        return {n}\n"
+
+    usual = head == "(BaseEnv)"
+    assert change(text(1), text(2)).level == ("patched" if usual else "rebuilt")
+    assert change(text(1, "@seal\n"), text(2, "@seal\n")).level == "rebuilt"
+    register = "@register_env('A-v1')\n"
+    assert change(text(1, register), text(2, register)).level == ("patched" if usual else "rebuilt")
+    assert change("Task = note()\n", f"{text(2)}").level == "rebuilt"
+
+
+def test_the_hooks_that_may_behave_differently_are_named() -> None:
+    def hooks(old: str, new: str) -> tuple[frozenset[str], frozenset[str]]:
+        found = of_push_cube(old, new)
+        return found.hooks, found.tried_hooks
+
+    assert hooks("5 * distance", "6 * distance") == (
+        {"compute_dense_reward", "compute_normalized_dense_reward"},
+        frozenset(),
+    )
+    assert hooks("2 * torch.rand((b, 2)) - 1", "torch.rand((b, 2)) - 1") == ({"_initialize_episode"},) * 2
+    step = "def _after_control_step(self):\n    self.w = {}\n"
+    found = change(task(step.format(1)), task(step.format(2)))
+    assert found.hooks == found.tried_hooks == {"_after_control_step"}
+    assert change(PUSH_CUBE, PUSH_CUBE, "PushCubeEnv") == Change("same", found_reason(PUSH_CUBE))
+    both = PUSH_CUBE.replace("2 * torch.rand((b, 2)) - 1", "torch.rand((b, 2))").replace(
+        "eye=[0.45,", "eye=[0.5,"
+    )
+    assert change(PUSH_CUBE, both, "PushCubeEnv").hooks == {"_initialize_episode"}
+
+
+def found_reason(text: str) -> str:
+    return change(text, text, "PushCubeEnv").reason
+
+
+def test_a_new_or_a_lost_reward_hook_rebuilds() -> None:
+    one = "def compute_dense_reward(self, obs, action, info):\n    return 1\n"
+    two = one + "def compute_sparse_reward(self, info):\n    return 1\n"
+    for old, new in ((one, two), (two, one)):
+        assert change(task(old), task(new)).level == "rebuilt"
+
+
+def test_names_inherited_from_libraries_are_found_in_their_classes(monkeypatch: pytest.MonkeyPatch) -> None:
+    library, own = types.ModuleType("a_library"), types.ModuleType("an_author")
+    library.__file__, own.__file__ = "/lib/a_library.py", FILE
+    for module, text in (
+        (library, LIBRARY),
+        (own, "class Mine(Lib):\n    def _own(self):\n        self._own_use\n"),
+    ):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        vars(module).update({"BaseEnv": BaseEnv, "Lib": getattr(library, "Lib", None)})
+        exec(compile(text, str(module.__file__), "exec"), vars(module))
+    found = inherited_names(own.Mine, {FILE})
+    assert {"_scene", "annotated", "of_class", "_load_scene", "step", "prop"} <= found.names
+    assert "_own" not in found.names
+    uses = {"by_method", "by_property", "by_setter", "by_static", "by_inner", "by_classmethod"}
+    assert uses <= found.used_at_build and "_own_use" not in found.used_at_build
+    assert "get_obs" not in found.used_at_build, "what BaseEnv itself uses"
+
+
+LIBRARY = """
+class Lib(BaseEnv):
+    annotated: int
+    def _scene(self):
+        self.by_method
+        return [lambda: self.by_inner]
+    @property
+    def prop(self):
+        return self.by_property
+    @prop.setter
+    def prop(self, value):
+        self.by_setter
+    @staticmethod
+    def of_static(x):
+        x.by_static
+    @classmethod
+    def of_class(cls):
+        cls.by_classmethod
+"""
