@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tests.drive.live import Live
 from tests.drive.scenes import box_mesh, camera, running, table_scene, visual
 from workbench.cameras.events import CameraChosen
+from workbench.cameras.frustums import LARGE_METRES, SMALL_METRES
 from workbench.envs.camera_data import Picture
 from workbench.envs.inspection import Inspection, Touching
 from workbench.envs.task_drawings import Drawing
@@ -93,6 +94,7 @@ def test_all_in_the_view_is_that_of_the_selected_env(live: Live, alone: bool) ->
     spacing = [offset_of(live, env) for env in range(ENVS)]
     assert len({tuple(offset.round(3)) for offset in spacing}) == ENVS
     live.do(ShowEnvs(all_envs=not alone))
+    sizes: set[float] = set()
     for env in (0, 3, 1):
         live.show(shown(env))
         live.show(shown(env))
@@ -108,11 +110,23 @@ def test_all_in_the_view_is_that_of_the_selected_env(live: Live, alone: bool) ->
         dot = np.arange(3) / 7 + env * 3 / 7
         np.testing.assert_allclose(node(live, "/drawn/dot").points, [dot + offset], atol=1e-5)
         np.testing.assert_allclose(node(live, "/forces").points[0, 0], env + 1 + offset, atol=1e-5)
+        sizes.add(float(np.mean(node(live, "/cameras/sensor").scale)))
         np.testing.assert_allclose(
             node(live, "/cameras/sensor").position, picture(env).pose[:3] + offset, atol=1e-5
         )
         marks = [label for label in live.labels() if label == f"env {env}"]
         assert len(marks) == (0 if alone else 1) == len(live.nodes("/selected/frame"))
+    assert sizes == {SMALL_METRES if alone else LARGE_METRES}
+
+
+def test_of_two_envs_one_can_be_shown_alone(live: Live) -> None:
+    for alone in (True, False):
+        live.do(ShowEnvs(all_envs=not alone))
+        live.show(shown(1, num_envs=2))
+        assert len(live.bodies("cube")[0].batched_positions) == (1 if alone else 2)
+    live.do(ShowEnvs(all_envs=False))
+    live.show(shown(0, num_envs=1))
+    assert len(live.bodies("cube")[0].batched_positions) == 1 and live.labels() == ["cube"]
 
 
 @pytest.mark.parametrize("alone", [False, True])

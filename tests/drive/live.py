@@ -83,13 +83,15 @@ class Live(Panels):
         server: viser.ViserServer,
         clock: Clock | None = None,
         on_look: Callable[[Any], None] = lambda path: None,
+        **more: Any,
     ) -> None:
+        """`more` goes to `Page`."""
         super().__init__(server)
         self.clock, self.session = clock or Clock(), StubSession()
         self._envs = self._scenes = 0
         self.asked_by_drawing: list[Any] = []
         """What the last redraw asked of the session."""
-        self.page = Page(server, self.visitors, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
+        self.page = Page(server, self.visitors, self.session, on_look=on_look, clock=self.clock, **more)  # type: ignore[arg-type]
         self.visitors.do = self.page.do
 
     @property
