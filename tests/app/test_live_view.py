@@ -18,11 +18,15 @@ from workbench.cameras.frustums import LARGE_METRES, SMALL_METRES
 from workbench.envs.camera_data import Picture
 from workbench.envs.inspection import Inspection, Touching
 from workbench.envs.task_drawings import Drawing
-from workbench.live.commands import SelectBody, ShowForces
+from workbench.hands.commands import HideBody, ShowHiddenBodies
+from workbench.hands.reach import Reach
+from workbench.hands.state import Hands
+from workbench.live.commands import HoverBody, SelectBody, ShowForces
 from workbench.live.env_commands import ShowEnvs
 from workbench.live.events import ReadingChosen
 from workbench.live.view import SessionView
 from workbench.page.commands import FrameScene, ShowCollisions, ShowFrames, ShowFrustums
+from workbench.task.description import ArmDescription
 
 ENVS, CUBE = 5, 3
 HUMAN = camera("render_camera", "human")
@@ -44,13 +48,14 @@ def picture(env: int) -> Picture:
 
 def shown(env: int, num_envs: int = ENVS, **changes: Any) -> SessionView:
     """A view in which the pictures and the contacts are those of `env`, and the task drew a dot in each env."""
-    view = running(num_envs, selected_env=env, playing=False, state="paused", **changes)
+    held = {"hands": Hands(reach=Reach(shown=True)), **changes}
+    view = running(num_envs, selected_env=env, playing=False, state="paused", **held)
     assert view.task is not None and view.step is not None
     dots = np.arange(num_envs * 3, dtype=np.float32).reshape(num_envs, 1, 3) / 7
     contact = Touching(("cube", "table"), np.ones(3, np.float32), np.ones(3, np.float32), np.full((1, 3), env + 1, np.float32), np.ones((1, 3), np.float32), 0.0)  # fmt: skip
     return replace(
         view,
-        task=replace(view.task, cameras=(camera(), HUMAN)),
+        task=replace(view.task, cameras=(camera(), HUMAN), arms=(ArmDescription("arm/hand", ()),)),
         step=replace(view.step, poses=poses()[:num_envs], drawn={"dot": Drawing("points", dots)}),
         pictures={("sensor", "base_camera"): picture(env), **dict(changes.get("pictures", {}))},
         inspection=Inspection(env, 7, contacts=(contact,)),
@@ -74,6 +79,7 @@ def live(page: Live) -> Live:
     page.do(ShowEnvs(all_envs=True))
     page.do(ShowFrustums(on=True))
     page.do(SelectBody(body="cube"))
+    page.do(HoverBody(body="arm/hand"))
     page.show(shown(0))
     page.show(shown(0))
     return page
@@ -110,6 +116,13 @@ def test_all_in_the_view_is_that_of_the_selected_env(live: Live, alone: bool) ->
         dot = np.arange(3) / 7 + env * 3 / 7
         np.testing.assert_allclose(node(live, "/drawn/dot").points, [dot + offset], atol=1e-5)
         np.testing.assert_allclose(node(live, "/forces").points[0, 0], env + 1 + offset, atol=1e-5)
+        for name in ("/hands/grip", "/hands/gizmo"):
+            np.testing.assert_allclose(node(live, name).position, at, atol=1e-6)
+        hand = poses()[env, 2, :3] + offset
+        (handle,) = (one for one in live.nodes("/hands/reach/0") if one.name == "/hands/reach/0")
+        np.testing.assert_allclose(handle.position, hand, atol=1e-6)
+        hovered = node(live, "/hovered_body/box").points.reshape(-1, 3)
+        np.testing.assert_allclose((hovered.min(0) + hovered.max(0)) / 2, hand, atol=1e-6)
         sizes.add(float(np.mean(node(live, "/cameras/sensor").scale)))
         np.testing.assert_allclose(
             node(live, "/cameras/sensor").position, picture(env).pose[:3] + offset, atol=1e-5
@@ -126,7 +139,27 @@ def test_of_two_envs_one_can_be_shown_alone(live: Live) -> None:
         assert len(live.bodies("cube")[0].batched_positions) == (1 if alone else 2)
     live.do(ShowEnvs(all_envs=False))
     live.show(shown(0, num_envs=1))
-    assert len(live.bodies("cube")[0].batched_positions) == 1 and live.labels() == ["cube"]
+    assert len(live.bodies("cube")[0].batched_positions) == 1 and "env 0" not in live.labels()
+
+
+def test_a_hidden_body_is_not_drawn_until_it_is_shown_again(live: Live) -> None:
+    def drawn() -> list[Any]:
+        live.again()
+        return [
+            (one.batched_positions.tolist(), one.batched_scales, one.visible) for one in live.bodies("cube")
+        ]
+
+    before = drawn()
+    live.do(HideBody())
+    assert drawn() != before
+    live.do(ShowHiddenBodies())
+    assert drawn() == before
+
+
+def test_a_body_that_is_hovered_and_selected_has_one_mark(live: Live) -> None:
+    live.do(HoverBody(body="cube"))
+    live.again()
+    assert not live.nodes("/hovered_body/box") and live.nodes("/selected_body/box")
 
 
 @pytest.mark.parametrize("alone", [False, True])

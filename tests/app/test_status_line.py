@@ -112,6 +112,8 @@ def test_the_larger_of_two_causes_makes_the_run_slow() -> None:
     )
     assert slowed_by(replace(both, recorded_share=0.29, watched_share=0.29)) is None
     assert slowed_by(replace(both, task=None)) is None
+    assert slowed_by(replace(both, recorded_share=0.0)) is not None
+    assert status_values(slow())["why_slow"] == slowed_by(slow()) is not None
 
 
 def test_the_robot_is_named_with_its_control_mode_and_actions() -> None:

@@ -7,6 +7,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
@@ -247,7 +248,7 @@ def test_a_request_that_makes_no_sense_is_refused(several: Path) -> None:
     refused(seeds=0)
     refused(settings=(Setting("Swept.GAIN", (1.0,) * (MAX_POINTS + 1)),))
     refused(SettingError, options=TaskOptions(env_kwargs={"tall": False}))
-    (several.parent / "given.npy").touch()
+    np.save(several.parent / "given.npy", np.zeros((3, 8), np.float32))
     refused(actions=str(several.parent / "given.npy"))
     recordings_of(replace(options(several.parent, "Swept.GAIN=1"), task=str(several), options=TaskOptions(env_kwargs={"tall": False})))  # fmt: skip
 

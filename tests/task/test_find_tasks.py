@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.task.find import find_task_files, is_below, read_task_file
+from workbench.task import find
+from workbench.task.find import TaskFileReader, find_task_files, is_below, read_task_file
 
 REGISTERED = (
     'open({mark!r}, "w")\n@register_env("Push-v1", max_episode_steps=50)\nclass PushEnv(BaseEnv):\n    pass\n'
@@ -78,3 +80,64 @@ def test_no_text_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, raw
     assert found is None or found.path == file
     file.write_bytes(b"class Task(BaseEnv): pass\nx = '''" + raw)
     read_task_file(file)
+
+
+def test_a_search_ends_early_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b", "c", "deep/d", "deep/er/e"):
+        task(tmp_path / f"{name}.py")
+    whole = find_task_files(tmp_path)
+    assert len(whole.files) == 5 and not whole.left_out
+    for name, value, found in (
+        ("MAX_FILES_READ", 3, 3),
+        ("MAX_FOUND", 2, 2),
+        ("TIMEOUT_SECONDS", -1.0, 0),
+        ("MAX_DEPTH", 1, 4),
+        ("MAX_DEPTH", 2, 5),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(find, name, value)
+            some = find_task_files(tmp_path)
+            assert [one.path for one in some.files] == [one.path for one in whole.files[:found]], name
+            assert bool(some.left_out) is (name != "MAX_DEPTH")
+
+
+def test_a_file_is_read_again_only_if_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, reader = task(tmp_path / "a.py"), TaskFileReader()
+    read, kept = find.read_task_file, []
+    monkeypatch.setattr(find, "read_task_file", lambda path: kept.append(path) or read(path))
+    for _ in range(2):
+        found = reader.read(file)
+        assert found is not None and found.classes == ("Task",)
+    assert kept == [file]
+    stamp = file.stat()
+    file.write_text("class Othr(BaseEnv): pass\n")
+    os.utime(file, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    found = reader.read(file)
+    assert found is not None and found.classes == ("Othr",) and len(kept) == 2
+    file.unlink()
+    assert reader.read(file) is None
+    task(file)
+    assert reader.read(file) is not None
+
+
+def test_classes_in_branches_count_and_base_env_itself_does_not(tmp_path: Path) -> None:
+    text = """
+if FAST:
+    class A(BaseEnv): pass
+else:
+    class B(BaseEnv): pass
+try:
+    class C(A): pass
+except ImportError:
+    pass
+with note():
+    @register_env("D-v1", "E-v1")
+    class D: pass
+class BaseEnv(Env): pass
+def made():
+    class F(BaseEnv): pass
+"""
+    found = read_task_file(task(tmp_path / "a.py", text))
+    assert found is not None and (found.classes, found.ids) == (("A", "B", "C", "D"), ("D-v1",))
+    broken = read_task_file(task(tmp_path / "b.py", "x = 1\nclass Push(BaseEnv):\n    def evaluate(self:\n"))
+    assert broken is not None and broken.not_python and broken.line == 3

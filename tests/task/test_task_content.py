@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 from pathlib import Path
 
 import pytest
 
-from workbench.task.content import CannotRead, read_content
+from workbench.task import content
+from workbench.task.content import CannotRead, TaskContent, read_content, source_hash
 from workbench.task.load import load_task
 from workbench.task.problem import TaskError
 from workbench.task.reference import RecordedTask
@@ -30,8 +32,8 @@ def ran(folder: Path) -> set[str]:
 
 
 def recorded(file: Path) -> RecordedTask:
-    content = read_content(file)
-    return RecordedTask("Lift-v1", content.main, "Lift", content.texts)
+    found = read_content(file)
+    return RecordedTask("Lift-v1", found.main, "Lift", found.texts)
 
 
 @pytest.mark.parametrize(
@@ -162,3 +164,71 @@ def test_a_module_refused_for_a_recording_is_found_for_a_task_opened_later(
     mine = tmp_path / "mine.py"
     mine.write_text(f"{TASK}{hidden}")
     assert load_task(str(mine)).class_name == "Lift" and "other" in ran(tmp_path)
+
+
+def test_modules_above_the_file_count_and_those_outside_of_its_packages_do_not(tmp_path: Path) -> None:
+    for package in ("pack", "pack/sub"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text("")
+    imports = "from . import near\nfrom .. import up\nfrom ..beside import far\nfrom ... import outside\nfrom .... import more\n"
+    lay(tmp_path, pack__sub__near="", pack__up="", pack__beside="far = 1", outside="", pack__unused="")
+    file = tmp_path / "pack" / "sub" / "task.py"
+    file.write_text(f"import outside\n{imports}")
+    content = read_content(file)
+    assert content.modules == (
+        "../../outside.py",
+        "../__init__.py",
+        "../beside.py",
+        "../up.py",
+        "__init__.py",
+        "near.py",
+    )
+    assert not content.computed
+    assert next(iter(content.texts)) == content.main == str(file)
+
+
+def test_sums_are_those_of_the_files_and_the_hash_that_of_the_texts(tmp_path: Path) -> None:
+    def content_of(name: str, text: bytes) -> TaskContent:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "task.py").write_text("import alone\n")
+        (tmp_path / name / "alone.py").write_bytes(text)
+        return read_content(tmp_path / name / "task.py")
+
+    unix, dos = content_of("unix", b"A = 1\nB = 2\n"), content_of("dos", b"A = 1\r\nB = 2\r\n")
+    assert list(unix.file_sums) == ["task.py", "alone.py"] and unix.hash == dos.hash
+    assert dos.file_sums["alone.py"] == hashlib.sha256(b"A = 1\r\nB = 2\r\n").hexdigest()
+    assert unix.file_sums["alone.py"] != dos.file_sums["alone.py"]
+    assert dos.texts[str(tmp_path / "dos" / "alone.py")] == "A = 1\nB = 2\n"
+    recorded = TaskContent("task.py", {"task.py": "x\n", "alone.py": "y\n"})
+    assert recorded.file_sums == {name: hashlib.sha256(text).hexdigest() for name, text in (("task.py", b"x\n"), ("alone.py", b"y\n"))}  # fmt: skip
+    other = TaskContent("alone.py", {"alone.py": "y\n", "task.py": "x\n"})
+    assert recorded.hash != other.hash, "another file of the same texts is opened"
+    joined = [TaskContent("t", {"t": "", "a": "bc"}), TaskContent("t", {"t": "", "ab": "c"})]
+    assert joined[0].hash != joined[1].hash
+
+
+def test_the_hash_of_a_source_does_not_depend_on_the_folder() -> None:
+    texts = {"/here/task.py": "x = 1\n", "/lib/other.py": "y = 1\n"}
+    there = {"/house/task.py": "x = 1\n", "/lib/other.py": "y = 1\n"}
+    assert source_hash(texts, Path("/here")) == source_hash(there, Path("/house"))
+    assert len(source_hash(texts, Path("/here"))) == 12
+    for changed in (
+        {**texts, "/lib/other.py": "y = 2\n"},
+        {"/here/task.py": "x = 1\n", "/lib/more.py": "y = 1\n"},
+    ):
+        assert source_hash(changed, Path("/here")) != source_hash(texts, Path("/here"))
+
+
+def test_compiled_modules_are_reported_and_too_many_modules_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = lay(tmp_path, task="import fast, alone", alone="")
+    (tmp_path / "fast.cpython-311.so").touch()
+    (tmp_path / "fast.txt").touch()
+    (unseen,) = read_content(file).unseen
+    assert "fast.cpython-311.so" in unseen
+    assert read_content(lay(tmp_path, task="import importlib\nimportlib.import_module('x')")).computed
+    monkeypatch.setattr(content, "MAX_MODULES", 2)
+    read_content(lay(tmp_path, task="import alone"))
+    with pytest.raises(CannotRead):
+        read_content(lay(tmp_path, task="import alone, other", other=""))

@@ -183,6 +183,28 @@ def test_a_save_without_a_file_system_event_is_seen_by_polling(
     assert calls.comes_next(last)
 
 
+def test_a_save_of_what_is_no_text_is_a_change_too(file: Path, last: Path, calls: Calls) -> None:
+    seen: queue.Queue[set[Path]] = queue.Queue()
+    watcher = SourceWatcher(seen.put)
+    watcher.follow([file])
+    for raw in (b"\xff\xfe one", b"\xff\xfe two"):
+        file.with_suffix(".tmp").write_bytes(raw)
+        file.with_suffix(".tmp").replace(file)
+        assert seen.get(timeout=TIMEOUT_SECONDS) == {file}
+    watcher.stop()
+
+
+def test_a_change_before_another_file_is_followed_is_still_seen(
+    watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
+) -> None:
+    """A second `follow` must not take the file's present content for known."""
+    path = tmp_path / "task.py"
+    path.write_text("a = 1\n")
+    watcher.follow([path], {str(path): "a = 0\n"})
+    watcher.follow([path, last])
+    assert calls.next() == {"task.py": "a = 1\n"}
+
+
 Many = Callable[[int, int], list[Path]]
 
 
