@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from dataclasses import replace
@@ -28,6 +29,7 @@ from workbench.sweep.job import (
     sweep,
 )
 from workbench.task.description import TaskOptions
+from workbench.task.problem import TaskError
 from workbench.task.settings_in_text import SettingError
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -58,6 +60,9 @@ def swept(out: Path) -> SweepReport:
     reports: list[RecordProgress] = []
     report = sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"), on_progress=reports.append)
     over = [progress.over for progress in reports if progress.over is not None]
+    last = reports[-1]
+    assert (last.kept, last.done, last.running) == (6, 6, {})
+    assert sorted(number for failure in last.failures for number in failure.numbers) == [4, 5, 6, 12, 13, 14]
     assert sorted(written.seed for _, written in over if written is not None) == [5, 5, 6, 6, 7, 7], (
         "every episode must be reported"
     )
@@ -99,6 +104,13 @@ def test_a_point_that_cannot_be_built_fails_in_its_rows_and_the_others_run(swept
     best, *_, last = swept.results.summaries()
     assert best.values == {"MOST": "1", "control_mode": '"pd_ee_delta_pos"'} and best.rate == 0
     assert (last.episodes, last.failed, last.rate) == (0, 3, None)
+
+
+def test_a_sweep_without_a_result_fails_and_a_stopped_one_says_what_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(TaskError):
+        sweep(options(tmp_path / "fails", "control_mode=nix,nex", seeds=1))
+    stopped = sweep(options(tmp_path / "stopped", "MOST=1,2"), stop=lambda: True)
+    assert stopped.stopped and stopped.missing == 6 and stopped.results.episodes == ()
 
 
 @pytest.mark.slow
@@ -172,8 +184,12 @@ class Swept(Base):
 
 class Other(BaseEnv):
     GAIN = 1.0
+    NOTHING = None
+    ONE = (1,)
+    FLAGS = [True, "a"]
+    FREE = {"a": 1}
 
-    def __init__(self, robot_uids="panda"):
+    def __init__(self, robot_uids="panda", *, only=1):
         super().__init__(robot_uids=robot_uids)
 """
 
@@ -202,6 +218,47 @@ def test_a_constant_is_changed_with_the_smallest_edit(several: Path) -> None:
     gain = "    GAIN: float = 0.5  # of the controller", "    GAIN: float = 2.0  # of the controller"
     assert changed(several, "Swept.GAIN=2") == ({}, *gain)
     assert changed(several, "GAIN=2", f"{several}:Swept") == ({}, *gain)
+
+
+def test_a_value_is_written_in_the_type_that_it_had(several: Path) -> None:
+    for given, new in (
+        ("NOTHING=3", "NOTHING = 3"),
+        ("GAIN=null", "GAIN = None"),
+        ("ONE=[2]", "ONE = (2,)"),
+        ("ONE=[2,3]", "ONE = (2, 3)"),
+        ('FLAGS=[false,"b","c"]', "FLAGS = [False, 'b', 'c']"),
+        ('FREE={"b":2}', "FREE = {'b': 2}"),
+    ):
+        (name, value) = given.split("=")
+        what = replace(options(several.parent, "a=1"), task=f"{several}:Other")
+        (recording,) = recordings_of(
+            replace(what, settings=(Setting(f"Other.{name}", (json.loads(value),)),))
+        )
+        (text,) = recording.source.values()
+        assert f"    {new}\n" in text, given
+    for given in ("FLAGS=[1]", "FREE=[1]", "GAIN=true", "GAIN=a", "ONE=1", "only=1"):
+        if given == "only=1":
+            assert changed(several, given, f"{several}:Other")[0] == {"only": 1}
+            continue
+        with pytest.raises(SettingError):
+            changed(several, f"Other.{given}", f"{several}:Other")
+    with pytest.raises(SettingError):
+        changed(several, "tall=true", f"{several}:Other")
+
+
+def test_any_name_may_be_an_argument_if_a_base_class_is_not_found(tmp_path: Path) -> None:
+    file = tmp_path / "odd.py"
+    file.write_text("from nowhere import Base\n\n\nclass Odd(Base):\n    SIZE = 1\n")
+    for given, kwargs in (("anything=2", {"anything": 2}), ("SIZE=2", {})):
+        (one,) = recordings_of(replace(options(tmp_path, given), task=str(file)))
+        assert one.options.env_kwargs == {**PLAIN, **kwargs}
+    (tmp_path / "kit").mkdir()
+    (tmp_path / "kit" / "base.py").write_text("class Base:\n    def __init__(self, far=1, **kwargs): pass\n")
+    for line in ("from kit.base import Base", "import kit.base as b", "import kit.base"):
+        base = {"import kit.base as b": "b.Base", "import kit.base": "kit.base.Base"}.get(line, "Base")
+        file.write_text(f"{line}\n\n\nclass Odd({base}):\n    pass\n")
+        (one,) = recordings_of(replace(options(tmp_path, "far=2"), task=str(file)))
+        assert one.options.env_kwargs["far"] == 2
 
 
 def test_a_constructor_argument_is_passed_to_the_env(several: Path) -> None:

@@ -108,6 +108,63 @@ def test_the_last_registered_class_is_loaded_and_the_others_are_named(write: Wri
     assert "One" in refused(f"{path}:Zebra").message
 
 
+def test_a_file_without_a_task_says_what_it_has_instead(write: Write) -> None:
+    head = "from mani_skill.agents.robots import Panda\nfrom mani_skill.envs.tasks import PushCubeEnv\n"
+    messages = {
+        text: refused(write("odd.py", text)).message
+        for text in ("# later\n\n", "x = 1\n", head, f"{head}class Arm(Panda):\n    uid = 'arm'\n")
+    }
+    empty, other, imported, robot = messages.values()
+    assert len({*messages.values()}) == 4 and "PushCubeEnv" in imported and "Arm" in robot
+    assert "PushCubeEnv" not in robot + empty + other and "Panda" not in imported
+
+
+def test_the_classes_to_try_next_are_of_the_same_kind_and_no_bases(write: Write) -> None:
+    path = write(
+        "push.py",
+        """
+        class Base(BaseEnv): pass
+        class Loose(BaseEnv): pass
+        @register_env("AuthorOne-v1")
+        class One(Base): pass
+        @register_env("AuthorTwo-v1")
+        class Two(Base): pass
+        @register_env("AuthorThree-v1")
+        class Three(One): pass
+        """,
+        task=True,
+    )
+    assert load_task(str(path)).alternatives == ("Two",)
+    assert load_task(f"{path}:Three").alternatives == ()
+    path.write_text(path.read_text().split("@register_env")[0] + "class Last(Base): pass\n")
+    again = load_task(str(path))
+    assert (again.class_name, again.alternatives) == ("Last", ("Loose",))
+    assert again.chosen == "Last" and again.others == ("Base", "Loose")
+
+
+def test_assets_of_a_registration_belong_to_the_task(write: Write) -> None:
+    registered = PUSH.replace("some_default=3", 'asset_download_ids=["ycb"]')
+    assert load_task(str(write("push.py", registered, task=True))).asset_ids == ("ycb",)
+    assert load_task("PickCube-v1").asset_ids == ()
+
+
+def test_a_class_registered_with_gymnasium_alone_has_its_id_and_limit(write: Write) -> None:
+    text = "import gymnasium\nclass Lone(BaseEnv):\n    pass\ngymnasium.register('Lone-v3', entry_point=Lone, max_episode_steps=11, kwargs={'a': 1})\n"
+    try:
+        task = load_task(str(write("lone.py", text, task=True)))
+    finally:
+        gym.registry.pop("Lone-v3", None)
+    assert (task.env_id, task.max_episode_steps, task.default_kwargs) == ("Lone-v3", 11, {"a": 1})
+
+
+def test_a_class_of_an_installed_module_is_opened_but_not_followed() -> None:
+    task = load_task("mani_skill.envs.tasks.tabletop.push_cube:PushCubeEnv")
+    assert (task.env_id, task.class_name, task.followed) == ("PushCube-v1", "PushCubeEnv", False)
+    for wrong in ("mani_skill.envs.tasks.tabletop.push_cube:PushCubEnv", "no_such_module_x:Task"):
+        refused(wrong)
+    assert "PushCubeEnv" in refused("mani_skill.envs.tasks.tabletop.push_cube:PushCubEnv").message
+
+
 # --- saved again ---------------------------------------------------------------------------------
 
 
