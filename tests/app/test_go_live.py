@@ -16,6 +16,7 @@ from tests.drive.episodes import made, write
 from tests.drive.panels import Panels
 from tests.drive.scenes import problem
 from tests.drive.waiting import until
+from workbench.app import go_live
 from workbench.app.go_live import GoLive, GoLivePart
 from workbench.app.pages import Which
 from workbench.app.server import App
@@ -37,10 +38,13 @@ class Consenter(Clearances):
         super().__init__()
         self.says_yes = threading.Event()
         self.asked = self.left = 0
+        self.says_no = False
 
     def clear(self, wanted: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
         self.asked += 1
-        until(lambda: self.says_yes.is_set() or stopped(), "an answer")
+        until(lambda: self.says_yes.is_set() or self.says_no or stopped(), "an answer")
+        if self.says_no:
+            raise NotCleared("a person said no")
         if stopped():
             self.left += 1
             raise NotCleared("no one waits for the answer")
@@ -54,6 +58,7 @@ class Desk:
         self.app, self.live, self.other, self.panels = app, live, other, panels
         self.person = Consenter()
         self.opened: list[TaskName] = []
+        self.options: list[TaskOptions] = []
         self.shown: list[str] = []
         """Requested pages; none is built."""
         app.shared.pages.show = self._show
@@ -64,6 +69,7 @@ class Desk:
 
     def _make(self, task: TaskName, options: TaskOptions) -> Session:
         self.opened.append(task)
+        self.options.append(options)
         return self.other
 
     def _show(self, which: Which, rebuild: bool = False) -> Future[None]:
@@ -185,3 +191,48 @@ def test_reopening_the_review_cancels_going_live(desk: Desk) -> None:
     until(lambda: desk.go_live.going().startswith("restoring"), "the restore")
     GoLivePart(desk.app.shared.server, desk.go_live)
     assert desk.go_live.going() == ""
+
+
+def test_the_recorded_code_is_opened_from_a_folder_that_is_removed_with_its_session(desk: Desk) -> None:
+    desk.part.draw(desk.app.shared.recordings.review.view())
+    desk.panels.set("Code", "as recorded")
+    desk.panels.set("Into", "all envs")
+    desk.person.says_yes.set()
+    desk.go(0)
+    until(lambda: desk.app.shared.session is desk.other, "the session of the recorded code")
+    (task,), (options,) = desk.opened, desk.options
+    file = Path(str(task).partition(".py")[0] + ".py")
+    assert file.name == "push.py" and file.read_text() == "reward = 1\n" and options.num_envs == 4
+    desk.wait_for_the_live_page()
+    # The open session runs recorded code, so the current code needs the session that the user opened.
+    desk.panels.set("Code", "today's")
+    desk.shown.clear()
+    desk.go(0)
+    desk.wait_for_the_live_page()
+    assert desk.app.shared.session is desk.live and len(desk.opened) == 1
+    desk.panels.do(ReturnToFirstTask())
+    do(desk.go_live.let_go)
+    until(lambda: not file.parent.exists(), "the end of the folder")
+    assert desk.other.view().state is not None
+
+
+def test_a_refusal_is_told_and_changes_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(go_live, "notify_all", lambda server, title, text, *_: told.append(text))
+    desk.person.says_no = True
+    for count in (1, 2):
+        desk.go(1)
+        until(lambda count=count: len(told) == count and not desk.go_live.going(), "the notice")
+    assert desk.opened == [] and desk.shown == [] and desk.app.shared.session is desk.live
+    desk.go(0, state=99)
+    assert len(told) == 3 and not desk.go_live.going(), "there is no such state"
+
+
+def test_reopening_the_review_does_not_cancel_a_question(desk: Desk) -> None:
+    desk.go(1)
+    until(lambda: desk.person.asked, "the question")
+    GoLivePart(desk.app.shared.server, desk.go_live)
+    assert desk.go_live.going()
+    desk.person.says_yes.set()
+    desk.wait_for_the_live_page()
+    assert desk.app.shared.session is desk.other and desk.options[0].num_envs == 1

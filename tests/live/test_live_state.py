@@ -354,6 +354,9 @@ def test_only_files_of_the_task_are_known(tmp_path: Path) -> None:
         assert knows(str(task)) and knows(str(beside)) and not knows(str(outside))
         assert not knows(str(task.parent / ".." / "secret.py")) and not knows("/etc/passwd")
         assert not knows(str(task.parent / "gone.py"))
+        (task.parent / "notes.txt").write_text("")
+        (task.parent / "link.py").symlink_to(outside)
+        assert not knows(str(task.parent / "notes.txt")) and not knows(str(task.parent / "link.py"))
         fake.session.change(action_source="policy", policy=f"{outside}:act")
         assert knows(str(outside)), "its policy"
 

@@ -279,6 +279,16 @@ def test_reordered_enum_members_rebuild() -> None:
     assert found.level == "rebuilt" and "Mode" in found.reason
 
 
+@pytest.mark.parametrize("members", ["    A = 1\n    B = 2\n", "    a: int\n    b: int\n"])
+def test_another_order_of_members_that_only_the_scene_uses_rebuilds(members: str) -> None:
+    head = "class Shape(Other):\n"
+    body = "def _load_scene(self, options):\n    self.shape = Shape(1, 2)\n"
+    lines = members.splitlines(keepends=True)
+    found = change(task(body, head + "".join(lines)), task(body, head + "".join(lines[::-1])))
+    assert found.level == "rebuilt" and "Shape" in found.reason
+    assert change(task(body, head + members), task(body, head + members + "    # more\n")).level == "same"
+
+
 def test_a_helper_module_beside_the_task_is_compared_too() -> None:
     texts = [
         {
@@ -397,12 +407,13 @@ def test_a_write_that_later_calls_may_skip_rebuilds() -> None:
         import beside|{ev};;>mine = beside.made();;>if self.f:;;>>mine[0] = NN
         from . import beside|{ev};;>mine = beside.made();;>if self.f:;;>>mine[0] = NN
         def made():;;>return 1|def evaluate(self, k=made()):;;>return NN
+        def size():;;>return NN|{ev};;>if self.f:;;>>self.w = size()
         def _initialize_episode(self, env_idx, options):;;>if options.get("all"):;;>>print(NN)
         def _initialize_episode(self, env_idx, options):;;>if self.reconfigures:;;>>print(NN)
         """,
         beside=BESIDE,
     )
-    assert {row: level for row, level in found.items() if level != "rebuilt"} == {} and len(found) == 36
+    assert {row: level for row, level in found.items() if level != "rebuilt"} == {} and len(found) == 37
 
 
 def test_a_write_in_every_call_or_to_a_new_value_is_patched() -> None:
