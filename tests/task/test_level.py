@@ -503,6 +503,8 @@ def test_a_value_of_the_file_that_may_change_while_the_task_runs_rebuilds() -> N
         ("def size():;;>return NN|def _load_scene(self, options):;;>note('here.size')", "rebuilt"),
         ("SIZE = NN|def _load_scene(self, options: SIZE) -> SIZE:;;>pass", "patched"),
         ("SIZE = NN;;if note():;;>SIZE = 3|def evaluate(self):;;>return SIZE", "rebuilt"),
+        ("def size():;;>return NN;;size = note(size)|def evaluate(self):;;>return size()", "rebuilt"),
+        ("class Inner:;;>x = NN;;def evaluate(self):;;>return 1", "rebuilt"),
         ("import threading|def evaluate(self):;;>return NN", "patched"),
         ("def far():;;>import threading;;>return NN|def evaluate(self):;;>return far()", "rebuilt"),
         ("def evaluate(self):;;>return type('T', (), {}) or NN", "rebuilt"),

@@ -67,3 +67,8 @@ def test_of_equal_lines_the_one_at_the_same_place_is_chosen() -> None:
     new = "import torch\n\n\n" + old.replace("class Task", "# the task\nclass Task")
     for line in (i for i, text in enumerate(old.splitlines(), 1) if "self.up = 1" in text):
         assert line_in(old, new, line) == line + 4
+
+
+def test_a_line_whose_comment_has_changed_is_the_one_at_the_same_place() -> None:
+    new = "import torch\n" + OLD.replace("# twice", "# two times")
+    assert line_in(OLD, new, at(OLD, "self.up = 2")) == at(new, "self.up = 2")
