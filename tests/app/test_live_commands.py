@@ -34,6 +34,8 @@ from workbench.page.commands import (
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.templates import render
 
+pytestmark = pytest.mark.thorough
+
 TEMPLATE = "vscode://file{file}:{line}"
 KEY = ("sensor", "base_camera")
 

@@ -28,6 +28,8 @@ from workbench.live.view import SessionView
 from workbench.page.commands import FrameScene, ShowCollisions, ShowFrames, ShowFrustums
 from workbench.task.description import ArmDescription
 
+pytestmark = pytest.mark.thorough
+
 ENVS, CUBE = 5, 3
 HUMAN = camera("render_camera", "human")
 GREY = np.full((6, 8, 3), 128, np.uint8)
@@ -51,7 +53,7 @@ def shown(env: int, num_envs: int = ENVS, **changes: Any) -> SessionView:
     held = {"hands": Hands(reach=Reach(shown=True)), **changes}
     view = running(num_envs, selected_env=env, playing=False, state="paused", **held)
     assert view.task is not None and view.step is not None
-    dots = np.arange(num_envs * 3, dtype=np.float32).reshape(num_envs, 1, 3) / 7
+    dots = (np.arange(num_envs * 3).reshape(num_envs, 1, 3) / 7).astype(np.float32)
     contact = Touching(("cube", "table"), np.ones(3, np.float32), np.ones(3, np.float32), np.full((1, 3), env + 1, np.float32), np.ones((1, 3), np.float32), 0.0)  # fmt: skip
     return replace(
         view,

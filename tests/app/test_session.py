@@ -14,9 +14,12 @@ import pytest
 from tests.drive.scenes import problem
 from tests.drive.session import FakeWorker, FakeWorkerSession, fake_worker_session, wait_until
 from tests.drive.waiting import until
+from workbench.checks.commands import CheckAfterSave
+from workbench.checks.state import ChecksView
 from workbench.live.commands import Interrupt, SetSeed, Step
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest, EnterRecording, Event, Load, TaskFailed
+from workbench.machine.kept_choices import kept_choices
 from workbench.task.description import TaskOptions
 
 
@@ -123,6 +126,17 @@ def test_a_restored_version_whose_file_has_changed_meanwhile_is_stale(tmp_path: 
             fake.greet()
             fake.load(**of_file)
             assert fake.view.stale is stale
+
+
+def test_whether_saves_are_checked_is_kept_for_later_runs(tmp_path: Path) -> None:
+    with opened(tmp_path, check=True) as (fake, _):
+        assert fake.view.of(ChecksView).after_each_save
+        for on in (False, True):
+            fake.session.do(CheckAfterSave(on=on))
+            until(lambda on=on: kept_choices().check_after_save is on, "the stored choice")
+            assert fake.view.of(ChecksView).after_each_save is on
+    with opened(tmp_path) as (fake, _):
+        assert not fake.view.of(ChecksView).after_each_save
 
 
 def test_each_entered_recording_has_its_own_number(tmp_path: Path) -> None:

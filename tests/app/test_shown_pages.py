@@ -26,6 +26,8 @@ from workbench.page.widgets.visitors import Visitor
 from workbench.record.saving_state import KeptEpisodes, SaveStatus, Saving
 from workbench.record.state import RecordingStatus
 
+pytestmark = pytest.mark.thorough
+
 
 class Shown:
     """A page that counts what is asked of it."""
@@ -313,7 +315,8 @@ def test_the_task_files_are_those_of_the_command_and_the_open_one(
 ) -> None:
     view = running(1)
     assert view.task is not None
-    session = SimpleNamespace(view=lambda: replace(view, task=replace(view.task, file="/home/me/push.py")))
+    opened = replace(view, task=replace(view.task, file="/home/me/push.py"))
+    session = SimpleNamespace(view=lambda: opened)
     given = tmp_path / "given.py"
     assert house_of(None, given).task_files() == (given,)
     assert house_of(session, given).task_files() == (Path("/home/me/push.py"), given)

@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.drive.session import TASKS
+from tests.drive.waiting import TIMEOUT_SECONDS
 from workbench.app.worker.main_loop import Worker
 from workbench.envs.inspection import Inspection
 from workbench.envs.maniskill_private import mark_camera_configs
@@ -39,7 +41,7 @@ from workbench.live.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter
 from workbench.machine.processes.wire import Call, MessageSocket
 from workbench.task.description import Stepped, TaskOptions
 
-pytestmark = pytest.mark.usefixtures("clean_process")
+pytestmark = [pytest.mark.thorough, pytest.mark.usefixtures("clean_process")]
 
 Kind = TypeVar("Kind")
 OPTIONS = TaskOptions(3, seed=4, env_kwargs={"render_backend": "none"})
@@ -67,7 +69,8 @@ class Server:
 
     def until(self, kind: type[Kind], fits: Callable[[Kind], object] = lambda event: True) -> Kind:
         """The next event of this kind that fits."""
-        while (event := self._line.receive(30.0)) is not None:
+        deadline = time.monotonic() + TIMEOUT_SECONDS
+        while (event := self._line.receive(max(deadline - time.monotonic(), 0.0))) is not None:
             self.events.append(event)
             if isinstance(event, kind) and fits(event):
                 return event
@@ -154,6 +157,13 @@ def test_each_env_ends_and_is_reset_at_its_own_step(file: Path) -> None:
         server.send(Settings(episode_end="continue"))
         assert server.step().step.truncated.tolist() == mask(1)
         assert server.step().step.elapsed_steps.tolist() == [2, 5, 2], "nothing was reset"
+        seeds = set[int]()
+        for _ in range(2):
+            server.send(Reset((0, 2)))
+            fresh = server.until(Stepped)
+            assert fresh.reset_mask.tolist() == mask(0, 2) and fresh.seeds is not None
+            seeds |= {*fresh.seeds[[0, 2]].tolist()}
+        assert len(seeds) == 4, "each reset without a seed has new ones"
         # A reset with the same seed repeats the episode, its random actions too.
         episodes = []
         for _ in range(2):

@@ -365,7 +365,7 @@ def levels_of(rows: str, **beside: str) -> dict[str, str]:
             )
             for n in "12"
         ]
-        found[row] = change(texts[0], texts[1], **beside).level
+        found[row] = change(texts[0], texts[1], "Task", BASE_ENV, **beside).level
     return found
 
 
