@@ -13,12 +13,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from workbench.episodes.episode import BrokenFile, Episode
+from tests.drive.episodes import made
+from workbench.envs.camera_data import CameraInfo
+from workbench.episodes.encoded_pictures import EncodedPictures, encode_jpeg
+from workbench.episodes.episode import NO_SEED, BrokenFile, CameraTrack, Episode
 from workbench.episodes.films import MAX_FRAMES, FilmPart
 from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
 from workbench.episodes.lerobot.format import Choice, frames_of
 from workbench.episodes.lerobot.read import lerobot_rows, read_lerobot
-from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.reading import read_recording
 from workbench.episodes.row import UnreadableRecording
 from workbench.library.folder import Library, LibraryError
@@ -26,15 +28,44 @@ from workbench.library.folder import Library, LibraryError
 pytestmark = pytest.mark.usefixtures("child_process")
 
 
+STEPS = 8
+
+
+def camera_track(name: str, height: int, width: int, first_shade: int, states: int) -> CameraTrack:
+    """A camera whose picture of state k has the shade `first_shade` + 20 k, and a white row at the top."""
+    info = CameraInfo(
+        name, "sensor", width, height, 1.0, 0.01, 9.0, np.eye(3, dtype=np.float32), None, ("rgb",)
+    )
+    pictures = np.repeat(
+        first_shade + 20 * np.arange(states, dtype=np.uint8)[:, None, None, None], height, axis=1
+    )
+    pictures = np.broadcast_to(pictures, (states, height, width, 3)).copy()
+    pictures[:, :2] = 255
+    blobs = EncodedPictures("rgb", [encode_jpeg(picture) for picture in pictures])
+    pose = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (states, 1))
+    return CameraTrack(info, np.arange(states), pose, blobs)
+
+
+def episode_of(steps: int, seed: int = 3) -> Episode:
+    """Each number of the episode tells its step; the second camera has an odd size."""
+    states = np.arange(steps + 1, dtype=np.float32)
+    return replace(
+        made(steps, seed=seed, source_hash=f"version {seed}", env_kwargs={"robot_uids": "panda"}),
+        action=np.outer(states[1:], [0.5, -seed]).astype(np.float32),
+        obs={
+            "agent/qpos": np.outer(states, np.arange(1, 10, dtype=np.float32)),
+            "extra/goal": np.outer(states, [1.0, 2.0, 3.0]),
+        },
+        cameras=[
+            camera_track("base_camera", 32, 48, 10, steps + 1),
+            camera_track("hand/eye", 33, 25, 40, steps + 1),
+        ],
+    )
+
+
 @pytest.fixture(scope="module")
-def episode(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Episode:
-    read = read_episode(recorded.episode.write(tmp_path_factory.mktemp("recordings")).json)
-    states = np.arange(read.length + 1, dtype=np.float32)
-    obs = {
-        "agent/qpos": np.outer(states, np.ones(9, np.float32)),
-        "extra/goal": np.outer(states, [1.0, 2.0, 3.0]),
-    }
-    return replace(read, obs=obs)
+def episode() -> Episode:
+    return episode_of(STEPS)
 
 
 @pytest.fixture
@@ -44,19 +75,6 @@ def succeeding(episode: Episode) -> Episode:
     return replace(episode, evaluate={**episode.evaluate, "success": succeeds})
 
 
-def shorter(episode: Episode, steps: int) -> Episode:
-    """The episode's first `steps` steps."""
-    return replace(
-        episode,
-        action=episode.action[:steps],
-        reward=episode.reward[:steps],
-        terminated=episode.terminated[:steps],
-        truncated=episode.truncated[:steps],
-        evaluate={key: values[: steps + 1] for key, values in episode.evaluate.items()},
-        obs={key: values[: steps + 1] for key, values in episode.obs.items()},
-    )
-
-
 def export(folder: Path, *episodes: Episode, options: ExportOptions | None = None) -> Any:
     sources = [
         (f"episode {index}", lambda episode=episode: episode) for index, episode in enumerate(episodes)
@@ -64,76 +82,115 @@ def export(folder: Path, *episodes: Episode, options: ExportOptions | None = Non
     return export_lerobot(sources, folder, options or ExportOptions())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "limits", [{}, {"DATA_MB": 0, "VIDEO_MB": 0, "CHUNK_SIZE": 2}], ids=["one", "many files"]
 )
 def test_exported_episodes_are_read_back(
-    episode: Episode, limits: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    limits: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, limit in limits.items():
         monkeypatch.setattr(f"workbench.episodes.lerobot.format.{name}", limit)
-    made = export(tmp_path / "set", shorter(episode, 5), shorter(episode, 4), episode)
-    assert (made.episodes, made.frames) == (3, 9 + episode.length)
+    given = [episode_of(5, seed=4), episode_of(4, seed=0), episode_of(STEPS)]
+    given[1].info = replace(given[1].info, task="Pull-v1")
+    given[1].evaluate["success"][2] = True
+    done = export(tmp_path / "set", *given)
+    assert (done.episodes, done.frames, done.notes) == (3, 9 + STEPS, [])
     files = [
         path.relative_to(tmp_path / "set/data").as_posix()
         for path in (tmp_path / "set/data").rglob("*.parquet")
     ]
     expected = ["chunk-000/file-000.parquet", "chunk-000/file-001.parquet", "chunk-001/file-000.parquet"]
     assert sorted(files) == expected[: 3 if limits else 1]
-    first, second, third = lerobot_rows(tmp_path / "set")
-    assert (first.length, second.length, third.length) == (5, 4, episode.length)
-    assert third.seed == episode.info.seed
-    assert third.total_reward == pytest.approx(float(episode.reward.sum()), rel=1e-5)
-    read = read_lerobot(tmp_path / "set", 2)
-    assert read.geometry is None and read.info.control_dt == pytest.approx(episode.info.control_dt)
-    assert read.action_names == tuple(name.replace("/", ".") for name in episode.action_names)
-    np.testing.assert_array_equal(read.action, episode.action)
-    np.testing.assert_array_equal(read.reward, episode.reward)
-    np.testing.assert_array_equal(read.obs["state"][:-1], episode.obs["agent/qpos"][:-1])
-    assert np.isnan(read.obs["state"][-1]).all(), "a LeRobot dataset lacks the last state"
-    cameras = {camera.info.name: camera for camera in episode.cameras}
-    assert {camera.info.name for camera in read.cameras} == set(cameras)
-    for camera in read.cameras:
-        of = cameras[camera.info.name]
-        assert camera.rgb is not None and of.rgb is not None and len(camera.rgb) == episode.length
-        # Each frame is the picture of its own state, not of the state before or after.
-        for state in range(episode.length):
-            distances = [
-                np.abs(camera.rgb[state].astype(int) - of.rgb[other].astype(int)).mean()
-                for other in range(episode.length)
-            ]
-            assert int(np.argmin(distances)) == state
+    for index, (row, episode) in enumerate(zip(lerobot_rows(tmp_path / "set"), given, strict=True)):
+        assert (row.trajectory, row.length, row.seed) == (str(index), episode.length, episode.info.seed)
+        assert (row.task, row.copy_of, row.success) == (episode.info.task, episode.info.id, index == 1)
+        assert row.total_reward == episode.reward.sum()
+        read = read_lerobot(tmp_path / "set", index)
+        assert (read.geometry, read.poses, read.length) == (None, None, episode.length)
+        assert (read.info.task, read.info.seed, read.info.id) == (
+            episode.info.task,
+            episode.info.seed,
+            f"set-{index}",
+        )
+        assert (read.info.source_hash, read.info.control_dt) == (episode.info.source_hash, 0.05)
+        assert read.action_names == ("arm.joint1", "gripper")
+        np.testing.assert_array_equal(read.action, episode.action)
+        np.testing.assert_array_equal(read.reward, episode.reward)
+        np.testing.assert_array_equal(read.terminated, episode.terminated)
+        assert not read.truncated.any()
+        np.testing.assert_array_equal(read.evaluate["success"], episode.evaluate["success"])
+        np.testing.assert_array_equal(read.obs["state"][:-1], episode.obs["agent/qpos"][:-1])
+        assert np.isnan(read.obs["state"][-1]).all(), "a LeRobot dataset lacks the last state"
+        for camera, (name, height, width, first) in zip(
+            read.cameras, [("base_camera", 32, 48, 10), ("hand_eye", 33, 25, 40)], strict=True
+        ):
+            assert camera.info.key == ("sensor", name) and camera.rgb is not None
+            assert camera.frame.tolist() == list(range(episode.length)) and len(camera.rgb) == episode.length
+            for state in range(episode.length):
+                picture = camera.rgb[state]
+                assert picture.shape == (height, width, 3) == (camera.info.height, camera.info.width, 3)
+                # Each frame is the picture of its own state, not of the state before or after.
+                assert picture[8:].mean() == pytest.approx(first + 20 * state, abs=4)
+    data = pq.read_table(tmp_path / "set/data").sort_by("index")
+    assert data["task_index"].to_pylist() == [0] * 5 + [1] * 4 + [0] * STEPS
+    assert pq.read_table(tmp_path / "set/meta/tasks.parquet")["task_index"].to_pylist() == [0, 1]
+    with pytest.raises(UnreadableRecording, match="no episode 3"):
+        read_lerobot(tmp_path / "set", 3)
 
 
-@pytest.mark.slow
 def test_the_tables_follow_the_format(episode: Episode, succeeding: Episode, tmp_path: Path) -> None:
     folder = tmp_path / "set"
-    export(folder, episode, succeeding, options=ExportOptions(instruction="pick it up"))
+    short = episode_of(4)
+    given = (short, succeeding, episode)
+    export(folder, *given, options=ExportOptions(instruction="pick it up"))
     info = json.loads((folder / "meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0"
-    assert (info["fps"], info["total_episodes"], info["splits"]) == (20, 2, {"train": "0:2"})
-    assert info["features"]["action"]["shape"] == [episode.action.shape[1]]
-    assert all("/" not in key for key in info["features"])
+    assert (info["codebase_version"], info["robot_type"]) == ("v3.0", "panda")
+    assert (info["fps"], info["total_episodes"], info["splits"]) == (20, 3, {"train": "0:3"})
+    assert (info["total_frames"], info["total_tasks"]) == (4 + 2 * STEPS, 1)
+    assert info["features"]["action"]["shape"] == [2] and all("/" not in key for key in info["features"])
+    for name, size in (("base_camera", [32, 48]), ("hand_eye", [33, 25])):
+        feature = info["features"][f"observation.images.{name}"]
+        assert feature["shape"] == [*size, 3] and feature["names"] == ["height", "width", "channels"]
+        film = feature["info"]
+        assert [film["video.height"], film["video.width"], film["video.fps"]] == [*size, 20]
     rows = pq.read_table(folder / "data/chunk-000/file-000.parquet")
     assert set(rows.column_names) == {key for key, of in info["features"].items() if of["dtype"] != "video"}
-    assert rows["index"].to_pylist() == list(range(2 * episode.length))
-    assert rows["frame_index"].to_pylist() == 2 * list(range(episode.length))
-    assert rows["timestamp"].to_numpy() == pytest.approx(np.tile(np.arange(episode.length) / 20, 2))
-    assert rows["next.success"].to_pylist()[-3:] == [False, True, False]
+    lengths = [4, STEPS, STEPS]
+    assert rows["index"].to_pylist() == list(range(sum(lengths)))
+    assert rows["frame_index"].to_pylist() == [frame for length in lengths for frame in range(length)]
+    assert rows["episode_index"].to_pylist() == np.repeat(range(3), lengths).tolist()
+    assert rows["timestamp"].to_pylist() == pytest.approx([f / 20 for n in lengths for f in range(n)])
+    assert rows["next.success"].to_pylist()[4 + STEPS - 3 : 4 + STEPS] == [False, True, False]
+    assert [len(rows["observation.state"][k]) for k in range(3)] == [9] * 3
     episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    second = episodes[1]
-    assert (second["dataset_from_index"], second["dataset_to_index"]) == (episode.length, 2 * episode.length)
-    assert second["videos/observation.images.base_camera/from_timestamp"] == episode.length / 20
-    assert second["tasks"] == ["pick it up"]
+    ends = np.cumsum([0, *lengths])
+    for index, row in enumerate(episodes):
+        begin, end = ends[index : index + 2].tolist()
+        assert (row["episode_index"], row["length"], row["tasks"]) == (index, end - begin, ["pick it up"])
+        assert (row["dataset_from_index"], row["dataset_to_index"]) == (begin, end)
+        for name in ("base_camera", "hand_eye"):
+            film = f"videos/observation.images.{name}"
+            assert (row[f"{film}/from_timestamp"], row[f"{film}/to_timestamp"]) == (begin / 20, end / 20)
+        np.testing.assert_allclose(row["stats/action/mean"], given[index].action.mean(axis=0))
     stats = json.loads((folder / "meta/stats.json").read_text())
-    both = np.concatenate([episode.action, episode.action])
-    assert stats["action"]["mean"] == pytest.approx(both.mean(axis=0), abs=1e-6)
-    assert stats["action"]["std"] == pytest.approx(both.std(axis=0), abs=1e-6)
-    assert np.array(stats["observation.images.base_camera"]["mean"]).shape == (3, 1, 1)
+    together = np.concatenate([one.action for one in given]).astype(np.float64)
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(stats["action"][name], getattr(together, name)(axis=0), atol=1e-6)
+    assert stats["action"]["count"] == [sum(lengths)]
+    assert np.all(np.array(stats["action"]["q10"]) <= stats["action"]["q90"])
+    shades = np.concatenate([10 + 20 * np.arange(length) for length in lengths])
+    of_pictures = stats["observation.images.base_camera"]
+    assert np.array(of_pictures["mean"]).shape == (3, 1, 1) and of_pictures["count"] == [sum(lengths)]
+    # A sixteenth of each picture is white.
+    assert np.ravel(of_pictures["mean"]) == pytest.approx(
+        [shades.mean() / 255 * 15 / 16 + 1 / 16] * 3, abs=0.02
+    )
+    assert np.ravel(of_pictures["max"]) == pytest.approx([1] * 3, abs=0.03)
     tasks = pq.read_table(folder / "meta/tasks.parquet")
-    assert tasks["__index_level_0__"].to_pylist() == ["pick it up"]
+    assert tasks["__index_level_0__"].to_pylist() == ["pick it up"] and tasks["task_index"].to_pylist() == [0]
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
+    ours = json.loads((folder / "meta/workbench.json").read_text())["episodes"]
+    assert [one["id"] for one in ours] == [one.info.id for one in given]
 
 
 def test_only_successes_are_exported_on_request(
@@ -155,31 +212,100 @@ def test_only_successes_are_exported_on_request(
 def test_the_exported_features_can_be_chosen(episode: Episode) -> None:
     frames = frames_of(episode, Choice(state=("extra",), environment=("agent/qpos",), cameras=(), every=3))
     assert frames.names["observation.state"] == ["extra.goal.0", "extra.goal.1", "extra.goal.2"]
-    assert frames.columns["observation.environment_state"].shape == (3, 9)
+    assert frames.columns["observation.state"][:, 2].tolist() == [0, 9, 18]
+    np.testing.assert_array_equal(
+        frames.columns["observation.environment_state"], episode.obs["agent/qpos"][[0, 3, 6]]
+    )
     assert frames.columns["action"].tolist() == episode.action[[0, 3, 6]].tolist()
-    assert frames.columns["next.reward"].sum() == pytest.approx(episode.reward.sum(), rel=1e-5)
+    assert frames.columns["next.reward"].tolist() == [[1 + 2 + 3], [4 + 5 + 6], [7 + 8]]
+    # A frame tells what happened in its own step and in the skipped ones after it.
+    happened = replace(
+        episode,
+        evaluate={"success": np.arange(STEPS + 1) == 3},
+        terminated=np.arange(STEPS) == 4,
+        truncated=np.arange(STEPS) == 7,
+    )
+    some = frames_of(happened, Choice(every=3))
+    assert some.columns["next.success"].tolist() == [[True], [False], [False]]
+    assert some.columns["next.done"].tolist() == [[False], [True], [True]]
+    assert [round(float(one[8:].mean() - 40) / 20) for one in some.pictures("hand/eye")] == [0, 3, 6]
     with pytest.raises(ValueError, match="no observation 'agnet'; it has agent/qpos, extra/goal"):
         frames_of(episode, Choice(state=("agnet",)))
     with pytest.raises(ValueError, match="no camera 'x'"):
         frames_of(episode, Choice(cameras=("x",)))
-    joints = frames_of(
-        replace(episode, obs={}, env_states={"articulations/panda": np.zeros((episode.length + 1, 31))})
-    )
-    assert joints.columns["observation.state"].shape == (episode.length, 9)
+    # Root pose and velocities (13 numbers), then positions and velocities of 9 joints.
+    arm = np.arange((STEPS + 1) * 31).reshape(STEPS + 1, 31)
+    joints = frames_of(replace(episode, obs={}, env_states={"articulations/panda": arm}))
+    np.testing.assert_array_equal(joints.columns["observation.state"], arm[:-1, 13:22])
+    goal = replace(episode, obs={"": np.ones((STEPS + 1, 2), np.float32), "one": np.zeros(STEPS + 1)})
+    assert frames_of(goal).names["observation.state"] == ["state.0", "state.1", "one"]
 
 
 def test_a_lower_rate_must_divide_the_control_rate(episode: Episode, tmp_path: Path) -> None:
-    made = export(tmp_path / "set", episode, options=ExportOptions(fps=10))
-    assert made.frames == episode.length // 2
+    half = ExportOptions(fps=10)
+    progress: list[tuple[int, str]] = []
+    sources = [(name, lambda: episode) for name in ("first", "second")]
+    done = export_lerobot(sources, tmp_path / "set", half, lambda *at: progress.append(at))
+    assert done.frames == STEPS and progress == [(0, "first"), (1, "second"), (2, "done")]
+    assert read_lerobot(tmp_path / "set", 1).info.control_dt == 0.1
     with pytest.raises(ValueError, match="not an integer multiple of 7"):
         export(tmp_path / "other", episode, options=ExportOptions(fps=7))
+    slower = replace(episode, info=replace(episode.info, control_dt=0.1))
+    with pytest.raises(ValueError, match="frame rate"):
+        export(tmp_path / "other", episode, slower)
+    odd = replace(episode, info=replace(episode.info, control_dt=1 / 30.3))
+    assert export(tmp_path / "odd", odd, odd).notes == [
+        "The format has only integer frame rates: 30.300 per second is written as 30."
+    ]
+    with pytest.raises(FileExistsError):
+        export(tmp_path / "odd", episode)
+    assert len(lerobot_rows(tmp_path / "odd")) == 2
+
+
+def test_a_dataset_of_another_program_is_read(episode: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode_of(4), episode)
+    (folder / "meta/workbench.json").unlink()
+    info = json.loads((folder / "meta/info.json").read_text())
+    features = info["features"]
+    camera = features["observation.images.base_camera"]
+    features["observation.images.base_camera"] = camera | {
+        "shape": [3, 32, 48],
+        "names": ["channels", "height", "width"],
+    }
+    features["action"]["names"] = {"motors": ["shoulder", "gripper"]}
+    for name in ("next.reward", "next.success"):
+        del features[name]
+
+    def write_info(**change: object) -> None:
+        (folder / "meta/info.json").write_text(json.dumps({**info, **change}))
+
+    write_info()
+    read = read_lerobot(folder, 1)
+    assert read.action_names == ("shoulder", "gripper") and read.info.seed == NO_SEED
+    assert (read.cameras[0].info.height, read.cameras[0].info.width) == (32, 48)
+    assert read.evaluate == {} and read.reward.tolist() == [0] * STEPS
+    row = lerobot_rows(folder)[1]
+    assert (row.total_reward, row.success, row.seed, row.length) == (None, None, None, STEPS)
+    features["action"]["names"] = ["too few"]
+    write_info()
+    assert read_lerobot(folder, 1).action_names == ("action[0]", "action[1]")
+    for change in (
+        {"codebase_version": "v2.1"},
+        {"fps": 0},
+        {"features": []},
+        {"data_path": "../other.parquet"},
+    ):
+        write_info(**change)
+        with pytest.raises(UnreadableRecording, match="set"):
+            read_lerobot(folder, 1)
 
 
 def test_incompatible_episodes_are_refused_and_no_file_is_left(episode: Episode, tmp_path: Path) -> None:
-    narrow = replace(episode, action=episode.action[:, :2], action_names=episode.action_names[:2])
+    narrow = replace(episode, action=episode.action[:, :1], action_names=episode.action_names[:1])
     with pytest.raises(
         ValueError,
-        match=r"episode 1 does not fit into a dataset with episode 0: the shape of action is \[2\]",
+        match=r"episode 1 does not fit into a dataset with episode 0: the shape of action is \[1\]",
     ):
         export(tmp_path / "set", episode, narrow)
     assert list(tmp_path.iterdir()) == []
