@@ -232,6 +232,7 @@ def test_episodes_that_fail_or_do_not_fit_are_left_out_on_request(tmp_path: Path
     assert [entry["workbench_id"] for entry in entries] == [once.info.id, always.info.id]
     assert [entry["success"] for entry in entries] == [False, True]
     assert [entry["elapsed_steps"] for entry in entries] == [4, 5]
+    assert [read_maniskill(done.file, f"traj_{k}").length for k in range(2)] == [4, 5]
     for refused, error in ((sources[2], UnreadableRecording), (sources[3], OtherDemonstration)):
         with pytest.raises(error):
             export_maniskill([sources[1], refused], tmp_path / "b.h5")
