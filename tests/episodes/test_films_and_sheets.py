@@ -20,7 +20,6 @@ from workbench.episodes.episode import Episode
 from workbench.episodes.films import (
     FilmEye,
     camera_of,
-    chosen_states,
     contact_sheet,
     default_eye,
     frames,
@@ -135,15 +134,7 @@ def test_the_default_eye_has_moving_bodies_in_view(episode: Episode) -> None:
     assert (np.arccos(np.clip(cosines, -1, 1)) < eye.fovy / 2).all()
 
 
-def test_a_sheet_shows_every_camera_from_the_first_to_the_last_state(episode: Episode) -> None:
-    succeeds = np.zeros(episode.length + 1, np.bool_)
-    succeeds[5:] = True
-    sheet = contact_sheet(replace(episode, evaluate={"success": succeeds}), columns=4)
-    assert chosen_states(replace(episode, evaluate={"success": succeeds}), 4) == [0, 3, 5, 8]
-    pixels = np.asarray(sheet)
-    assert pixels.shape[1] > 4 * 176
-    green = (pixels[..., 1] > 100) & (pixels[..., 0] < 80) & (pixels[..., 2] < 100)
-    assert green.any(), "the success is not marked"
+def test_a_sheet_needs_pictures(episode: Episode) -> None:
     with pytest.raises(ValueError, match="no camera pictures"):
         contact_sheet(replace(episode, cameras=[]))
 
