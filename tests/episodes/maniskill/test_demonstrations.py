@@ -29,12 +29,13 @@ HEIGHT, WIDTH = 6, 8
 
 
 def camera_track(name: str, kind: CameraKind, states: int, first: int) -> CameraTrack:
-    """A camera that turns at every second state; each picture tells its state, each pixel column differs."""
+    """A camera that turns at every second state and ends where it began; each picture tells its state, each pixel column differs."""
     turns = Rotation.random(states, random_state=first).as_quat()[:, [3, 0, 1, 2]]
     pose = np.concatenate([np.arange(3 * states).reshape(states, 3) + first, turns], axis=1).astype(
         np.float32
     )
     pose[1::2] = pose[: states - states % 2 : 2]
+    pose[-1] = pose[0]
     column = np.arange(WIDTH)
     numbers = first + 10 * np.arange(states)[:, None, None] + np.zeros((HEIGHT, 1), int) + column
     matrix = np.array([[9, 0, WIDTH / 2], [0, 7, HEIGHT / 2], [0, 0, 1]], np.float32)
@@ -205,6 +206,42 @@ def test_far_distances_and_large_ids_keep_to_the_numbers_of_the_format(tmp_path:
     (track,) = read_maniskill(done.file, "traj_0").cameras
     assert track.depth and track.segmentation
     assert track.depth[0] == pytest.approx(32.767) and (track.segmentation[1] == 32_767).all()
+
+
+def test_a_file_of_several_robots_without_rewards_and_with_distances_in_metres_is_read(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "theirs.h5"
+    depth = np.linspace(0, 2, 4 * HEIGHT * WIDTH, dtype=np.float32).reshape(4, HEIGHT, WIDTH, 1)
+    colours = np.full((4, HEIGHT, WIDTH, 4), 200, np.uint8)
+    with h5py.File(path, "w") as file:
+        for name, first in (("traj_3", 100), ("traj_7", 0)):
+            group = file.create_group(name)
+            group["actions/one"] = np.arange(6, dtype=np.float32).reshape(3, 2) + first
+            group["actions/two"] = np.full((3, 1), 9, np.float32)
+            group["terminated"], group["truncated"] = [False, False, True], [False, True, False]
+            group["fail"] = [False, True, True]
+            group["obs/sensor_data/eye/depth"], group["obs/sensor_data/eye/rgb"] = depth, colours
+    made_with = {"sim_config": {"control_freq": 50}, "sim_backend": "gpu"}
+    entries = [{"episode_id": 3, "episode_seed": 8}, {"episode_id": 7, "reset_kwargs": {"seed": [9]}}]
+    document = {"env_info": {"env_id": "Two-v1", "env_kwargs": made_with}, "episodes": entries}
+    path.with_suffix(".json").write_text(json.dumps(document))
+    read = read_maniskill(path, "traj_7")
+    assert (read.info.seed, read.info.control_dt, read.info.backend) == (9, 0.02, "gpu")
+    assert (read.info.acted_by, read.info.reset_options) == ((), {})
+    assert read.action.tolist() == [[0, 1, 9], [2, 3, 9], [4, 5, 9]]
+    assert read.action_names == ("one[0]", "one[1]", "two[0]") and np.isnan(read.reward).all()
+    assert read.evaluate["fail"].tolist() == [False, False, True, True] and "success" not in read.evaluate
+    (track,) = read.cameras
+    assert (
+        track.depth and track.rgb and track.segmentation is None and track.info.modalities == ("depth", "rgb")
+    )
+    np.testing.assert_allclose(track.depth[2], depth[2, ..., 0], atol=1e-6)
+    assert track.rgb[3].shape == (HEIGHT, WIDTH, 3) and (track.rgb[3] == 200).all()
+    assert track.pose.tolist() == [[0, 0, 0, 1, 0, 0, 0]] * 4
+    assert [facts.seed for facts, _ in read_found(tmp_path, scan_folder(tmp_path).found["theirs"])] == [8, 9]
+    with pytest.raises(UnreadableRecording):
+        read_maniskill(path, "traj_0")
 
 
 def unreadable() -> Episode:
