@@ -18,6 +18,7 @@ from workbench.episodes.sweep_results import (
     SweepResults,
     clean_results,
     read_results,
+    value_text,
     wilson,
     write_results,
 )
@@ -46,6 +47,70 @@ def test_points_are_summarised_best_first() -> None:
     assert (best.index, best.episodes, best.solved, best.solved_at_end, best.mean_return) == (0, 2, 1, 0, 2.0)
     assert best.means == {"reward_terms/reach": 0.5} and best.rate == 0.5
     assert (failed.episodes, failed.failed, failed.failure) == (0, 1, "push.py:3: ValueError: no")
+
+
+def test_each_point_is_summarised_by_its_own_episodes_only() -> None:
+    nan = math.nan
+    values: list[tuple[int, bool | None, bool | None, float | None, dict[str, float]]] = [
+        (0, True, False, 1.0, {"a": 1.0}),
+        (0, True, False, 3.0, {"a": 3.0, "b": 8.0}),
+        (0, False, False, None, {}),
+        (1, True, True, 9.0, {}),
+        (1, False, False, 1.0, {}),
+        (2, None, None, 7.0, {}),
+        (3, None, None, nan, {}),
+        (5, True, True, 6.0, {}),
+        (5, False, False, 6.0, {}),
+    ]
+    rows = [
+        SweepEpisode(point, seed, once, last, None, 10, total, means)
+        for seed, (point, once, last, total, means) in enumerate(values)
+    ]
+    rows += [SweepEpisode(1, 90, failure="first"), SweepEpisode(1, 91, failure="second")]
+    points = tuple({"x": str(k)} for k in range(6))
+    summaries = SweepResults("t", "a", 4, points, tuple(rows)).summaries()
+    assert [one.index for one in summaries] == [0, 5, 1, 2, 3, 4], "no return and NaN come last"
+    assert [one.values["x"] for one in summaries] == ["0", "5", "1", "2", "3", "4"]
+    best, even, second, unjudged, lost, nothing = summaries
+    assert (best.episodes, best.solved, best.solved_at_end, best.rate) == (3, 2, 0, 2 / 3)
+    assert (best.mean_return, best.means, best.failed) == (2.0, {"a": 2.0, "b": 8.0}, 0)
+    assert best.interval == wilson(2, 3) and unjudged.interval is None
+    assert (second.episodes, second.solved_at_end, second.failed, second.failure) == (2, 1, 2, "first")
+    assert (even.mean_return, second.mean_return, second.rate) == (6.0, 5.0, 0.5)
+    assert (unjudged.solved, unjudged.solved_at_end, unjudged.rate) == (None, None, None)
+    assert lost.mean_return is not None and math.isnan(lost.mean_return)
+    assert (nothing.episodes, nothing.mean_return, nothing.rate) == (0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("texts", "column"),
+    [
+        (["1", "2"], [1, 2]),
+        (["1", "2.5"], [1.0, 2.5]),
+        (["true", "false"], [True, False]),
+        (["true", "1"], ["true", "1"]),
+        (['"a"', '"b"'], ["a", "b"]),
+        (['"a"', "1"], ['"a"', "1"]),
+        (["[1]", "null"], ["[1]", "null"]),
+    ],
+)
+def test_other_programs_read_each_value_of_a_point_as_it_is(
+    tmp_path: Path, texts: list[str], column: list[object]
+) -> None:
+    rows = [SweepEpisode(k, seed, means={} if k else {"m": 0.5}) for k in (0, 1) for seed in (0, 1)]
+    results = SweepResults("t", "a", 2, tuple({"x": text} for text in texts), tuple(rows))
+    write_results(tmp_path / "r.parquet", results)
+    table = pq.read_table(tmp_path / "r.parquet")
+    assert table["set.x"].to_pylist() == [value for value in column for _ in (0, 1)]
+    assert table["mean.m"].to_pylist() == [0.5, 0.5, None, None]
+    assert clean_results(read_results(tmp_path / "r.parquet")) == results
+    assert [value_text(text) for text in ('"a b"', "1.5", "true", "[1]", "{")] == [
+        "a b",
+        "1.5",
+        "true",
+        "[1]",
+        "{",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -82,6 +147,10 @@ def test_rows_of_unknown_points_and_invalid_numbers_are_left_out(tmp_path: Path)
     file = rewritten(tmp_path / "r.parquet", point=[99, 0, -1], **{"return": [1.0, math.inf, math.nan]})
     cleaned = clean_results(read_results(file))
     assert [(row.seed, row.total_reward) for row in cleaned.episodes] == [(1, None)]
+    wild = {"a": math.nan, "b": 1.0, "c": math.inf, "d\n": 2.0}
+    many = replace(RESULTS.episodes[0], means=wild, failure="x" * 9999)
+    (row,) = clean_results(replace(RESULTS, episodes=(many, replace(many, seed=2**63)))).episodes
+    assert row.means == {"b": 1.0, "d": 2.0} and len(row.failure) < 9999
 
 
 @pytest.mark.parametrize(
