@@ -32,7 +32,11 @@ Maker = Callable[..., Made]
 
 
 def drawing(
-    kind: DrawingKind, *items: float, color: tuple[int, int, int] = (1, 2, 3), size: float = 0.5
+    kind: DrawingKind,
+    *items: float,
+    color: tuple[int, int, int] = (1, 2, 3),
+    size: float = 0.5,
+    text: str = "word",
 ) -> Drawing:
     """A drawing of one env: item k is at (items[k], ...)."""
     shape = (1, len(items), *ITEM_SHAPES[kind])
@@ -40,16 +44,18 @@ def drawing(
         shape[2:]
     )
     return Drawing(
-        kind, data.astype(np.float32).reshape(shape), color, size, ("word",) if kind == "text" else ()
+        kind, data.astype(np.float32).reshape(shape), color, size, (text,) if kind == "text" else ()
     )
 
 
 KINDS: st.SearchStrategy[DrawingKind] = st.sampled_from(tuple(ITEM_SHAPES))
 DRAWINGS = st.builds(
-    lambda kind, items, color: drawing(kind, *items, color=color),
+    lambda kind, items, color, size, text: drawing(kind, *items, color=color, size=size, text=text),
     KINDS,
     st.lists(st.integers(-9, 9), max_size=3),
     st.tuples(*[st.integers(0, 255)] * 3),
+    st.sampled_from([0.25, 0.5, 2.0]),
+    st.sampled_from(["word", "other", "ü \ud800"]),
 )
 
 
@@ -59,7 +65,8 @@ def assert_same(found: Mapping[str, Drawing], wanted: Mapping[str, Drawing]) -> 
     for name, one in wanted.items():
         there = found[name]
         np.testing.assert_allclose(there.data, one.data, atol=1e-5)
-        assert (there.kind, there.texts) == (one.kind, one.texts)
+        assert there.kind == one.kind
+        assert there.texts == tuple(text.encode("utf-8", "replace").decode() for text in one.texts)
         if one.kind != "frames":
             assert there.color == one.color
         if one.kind in ("points", "arrows", "frames"):
@@ -113,6 +120,22 @@ def test_rerun_shows_each_drawing_from_the_state_where_it_changes(
     np.testing.assert_allclose(strips[:, 0], [[1, 0, 0]] * 3, atol=1e-6)
     np.testing.assert_allclose(strips[:, 1], [[1, 0.2, 0], [0.8, 0, 0], [1, 0, 0.2]], atol=1e-6)
     np.testing.assert_array_equal(entities["/drawings/lines/edge"]["LineStrips3D:strips"].steps, [2])
+    shown = entities["/drawings/text/name"]["Points3D:show_labels"].values[0]
+    assert (
+        list(shown) == [True]
+        and len(entities["/drawings/frames/spawn"]["LineStrips3D:colors"].values[0]) == 3
+    )
+    made.drawn = [
+        {"way": drawing("frames", 1.0, size=size), "a": drawing("text", 1.0, text="")}
+        for size in (1, 2, 1, 1)
+    ]
+    entities = read_rrd(made.write(tmp_path).rrd)
+    lengths = [
+        np.linalg.norm(np.array(strips)[0, 1] - np.array(strips)[0, 0])
+        for strips in entities["/drawings/frames/way"]["LineStrips3D:strips"].values
+    ]
+    assert lengths == pytest.approx([1, 2, 1]), "each row has its own size"
+    assert entities["/drawings/text/a"]["Points3D:labels"].values[0] == ["a"]
 
 
 def test_a_task_that_draws_nothing_pays_nothing(make_episode: Maker, tmp_path: Path) -> None:
@@ -139,7 +162,7 @@ def test_a_drawing_that_grows_too_large_ends_with_a_text_at_its_place() -> None:
     end = int(tracks["cloud text"].states[0])
     assert 1000 < end < 1499 and tracks["cloud points"].at(end - 1) and not tracks["cloud points"].at(end)
     message = tracks["cloud text"].at(1499)
-    assert message is not None and message.data[0, 0, 0] == end
+    assert message is not None and message.data[0, 0, 0] == end and message.color == (255, 0, 0)
     last = tracks["dot points"].at(1499)
     assert last is not None and last.data[0, 0, 0] == 1499, "small drawings are still recorded"
 

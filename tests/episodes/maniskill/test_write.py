@@ -141,6 +141,16 @@ def test_success_belongs_to_the_state_after_the_step(
         assert group["success"][:].tolist() == [False, False, True]
 
 
+def test_columns_whose_names_are_folders_of_others_are_all_kept(
+    make_episode: Callable[..., Made], tmp_path: Path
+) -> None:
+    names = ["a", "a/b", "a/b/c", "a_b", "d/e", "d", "d_", "./x", "../x", "f//g"]
+    obs = {name: np.full(4, k, np.float32) for k, name in enumerate(names)}
+    found = read_episode(make_episode(3, obs=obs).write(tmp_path).h5).obs
+    assert sorted(values.tolist() for values in found.values()) == [[k] * 4 for k in range(len(names))]
+    assert found["a"][0] == 0 and found["d/e"][0] == 4 and found["f/g"][0] == 9
+
+
 def test_long_columns_are_compressed_and_read_back(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     """The columns are longer than a batch of the journal and than a chunk of the file."""
     count = np.arange(3001, dtype=np.float32)

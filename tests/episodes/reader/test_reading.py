@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import threading
@@ -14,9 +15,12 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from rerun.chunk import RrdReader
 
+from tests.drive.episodes import made, write
 from tests.drive.waiting import until
 from tests.episodes.library_files import describe
+from workbench.episodes.episode import CameraTrack
 from workbench.episodes.reader import reading
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.scan import scan_folder
@@ -128,20 +132,73 @@ def test_an_episode_equals_one_read_in_this_process(recorded: Any, tmp_path: Pat
                 np.testing.assert_array_equal(again[1], seen[1], strict=True)
 
 
-@pytest.mark.slow
-def test_pictures_are_read_after_the_reader_or_the_file_is_gone(recorded: Any, tmp_path: Path) -> None:
-    path = recorded.episode.write(tmp_path).json
-    (camera, *_) = [c for c in reading.read_recording(Source(path)).cameras if c.rgb is not None]
+def brightness(camera: CameraTrack, index: int) -> int:
     assert camera.rgb is not None
-    before = camera.rgb[0]
+    return round(float(camera.rgb[index].mean()))
+
+
+def test_pictures_are_read_after_the_reader_or_the_file_is_gone(tmp_path: Path) -> None:
+    path = write(tmp_path, made(4))
+    (camera,) = reading.read_recording(Source(path)).cameras
+    (other,) = reading.read_recording(Source(write(tmp_path, made(2, speed=1), every=2))).cameras
     reader = psutil.Process(reader_of(tmp_path, episodes=True))
     reader.kill()
     until(lambda: not reader.is_running() or reader.status() == psutil.STATUS_ZOMBIE, "its end")
-    np.testing.assert_array_equal(camera.rgb[0], before)
+    # In another order than before: each is opened again under its own number.
+    assert [brightness(other, 1), brightness(camera, 1), brightness(other, 0)] == pytest.approx(
+        [40, 20, 0], abs=2
+    )
     for file in tmp_path.iterdir():
         if file.is_file():
             file.unlink()
-    np.testing.assert_array_equal(camera.rgb[0], before)
+    assert [brightness(camera, 3), brightness(other, 1)] == pytest.approx([60, 40], abs=2)
+
+
+def test_recordings_of_many_folders_are_open_with_few_processes(tmp_path: Path) -> None:
+    def processes() -> int:
+        found = psutil.Process().children(recursive=True)
+        return sum(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in found)
+
+    before = processes()
+    folders = [tmp_path / str(k) for k in range(reading.MAX_READERS + 2)]
+    opened = [reading.read_recording(Source(write(folder, made(k + 1)))) for k, folder in enumerate(folders)]
+    until(lambda: processes() <= before + reading.MAX_READERS + 1, "the oldest readers have ended")
+    assert [episode.length for episode in opened] == list(range(1, len(folders) + 1))
+    # The first reader was replaced, and its pictures are read by a new one.
+    assert [brightness(one.cameras[0], one.length) for one in opened] == pytest.approx(
+        [20 * one.length for one in opened], abs=2
+    )
+
+
+def test_linked_files_and_a_folder_that_was_made_again_are_read(tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    path = write(there, made(3))
+    for file in there.glob(f"{path.stem}.*"):
+        (here / f"linked{file.suffix}").symlink_to(file)
+    episode = reading.read_recording(Source(here / "linked.json"))
+    assert episode.broken_files == () and episode.length == 3
+    assert brightness(episode.cameras[0], 2) == pytest.approx(40, abs=2)
+    assert rows(here)["linked"].length == 3
+    shutil.rmtree(here)
+    again = write(here, made(5))
+    assert list(rows(here)) == [again.stem] and rows(here)[again.stem].problem is None
+    assert reading.read_recording(Source(again)).length == 5
+
+
+def test_a_recording_is_named_to_reruns_viewer_by_its_own_id(tmp_path: Path) -> None:
+    path = write(tmp_path, made(1, task="A:b-v1"), pictures=False).with_suffix(".rrd")
+    (store,) = RrdReader(path).recordings()
+    assert reading.read_store_id(path) == f"Recording:workbench A\\:b-v1:{store.recording_id}"
+    (tmp_path / "none.rrd").write_bytes(b"")
+    with pytest.raises(UnreadableRecording, match="none"):
+        reading.read_store_id(tmp_path / "none.rrd")
+
+
+def test_recovered_episodes_are_counted_and_the_first_ones_named() -> None:
+    assert reading.recovered_text([]) == ""
+    assert reading.recovered_text(["a", "b", "c", "d", "e"]).endswith(": a, b, c and 2 more")
+    assert reading.recovered_text(["a"]).startswith("1 ") and reading.recovered_text(["a"]).endswith(": a")
 
 
 @pytest.mark.slow

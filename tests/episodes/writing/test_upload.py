@@ -16,7 +16,7 @@ from moto.server import ThreadedMotoServer
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.finish_or_recover import EpisodeFiles
 from workbench.episodes.writing.publish import RecordingError
-from workbench.episodes.writing.upload import remove_uploaded_id, upload_episode
+from workbench.episodes.writing.upload import remove_uploaded_id, require_place, upload_episode, upload_file
 from workbench.jobs.scheduler import Scheduler, ThisProcess, Work
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions, episode_id
@@ -130,8 +130,20 @@ def test_the_json_is_uploaded_last_so_a_partial_upload_is_no_episode(tmp_path: P
 
 def test_only_the_episode_with_that_id_is_removed(tmp_path: Path) -> None:
     files, place = _files(tmp_path), (tmp_path / "there").as_uri()
+    require_place(place + "/")
+    assert names(place) == [], "what was written to try the place is gone"
     upload_episode(files, place)
+    assert not any(path.exists() for path in (files.rrd, files.h5, files.json))
+    for name in ("Task_seed0001_env01_later.json", "Task_seed0001_env01_later.rrd"):
+        (tmp_path / "there" / name).write_text('{"workbench": {"id": "of another"}}')
+    (tmp_path / "note.txt").write_text("mine")
+    upload_file(tmp_path / "note.txt", place)
+    assert (tmp_path / "note.txt").exists()
+    others = ["Task_seed0001_env01_later.json", "Task_seed0001_env01_later.rrd", "note.txt"]
     remove_uploaded_id(place, "Task", 1, "another")
-    assert len(names(place)) == 3
+    assert len(names(place)) == 6
     remove_uploaded_id(place, "Task", 1, "mine")
-    assert names(place) == []
+    assert names(place) == others
+    for address in ((tmp_path / "note.txt").as_uri(), "unknown://there", "s4://bucket/folder"):
+        with pytest.raises(RecordingError):
+            require_place(address)
