@@ -229,6 +229,9 @@ def test_the_exported_features_can_be_chosen(episode: Episode) -> None:
     assert some.columns["next.success"].tolist() == [[True], [False], [False]]
     assert some.columns["next.done"].tolist() == [[False], [True], [True]]
     assert [round(float(one[8:].mean() - 40) / 20) for one in some.pictures("hand/eye")] == [0, 3, 6]
+    rare = replace(episode.cameras[1], frame=np.array([0, 5, 6, 7, 8, 9, 10, 11, 12]))
+    late = frames_of(replace(episode, cameras=[rare]), Choice(every=3))
+    assert [round(float(one[8:].mean() - 40) / 20) for one in late.pictures("hand/eye")] == [0, 0, 2]
     with pytest.raises(ValueError, match="no observation 'agnet'; it has agent/qpos, extra/goal"):
         frames_of(episode, Choice(state=("agnet",)))
     with pytest.raises(ValueError, match="no camera 'x'"):

@@ -154,13 +154,17 @@ def test_pictures_are_read_after_the_reader_or_the_file_is_gone(tmp_path: Path) 
     assert [brightness(camera, 3), brightness(other, 1)] == pytest.approx([60, 40], abs=2)
 
 
-def test_recordings_of_many_folders_are_open_with_few_processes(tmp_path: Path) -> None:
+def test_recordings_of_many_folders_are_open_with_few_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "MAX_READERS", 2)
+
     def processes() -> int:
         found = psutil.Process().children(recursive=True)
         return sum(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in found)
 
     before = processes()
-    folders = [tmp_path / str(k) for k in range(reading.MAX_READERS + 2)]
+    folders = [tmp_path / str(k) for k in range(3)]
     opened = [reading.read_recording(Source(write(folder, made(k + 1)))) for k, folder in enumerate(folders)]
     until(lambda: processes() <= before + reading.MAX_READERS + 1, "the oldest readers have ended")
     assert [episode.length for episode in opened] == list(range(1, len(folders) + 1))
