@@ -203,17 +203,65 @@ def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
     assert "eye" in read_properties(files.rrd)["episode"]["moved_cameras"]
 
 
-@pytest.mark.parametrize("large", [False, True])
-def test_a_thumbnail_of_another_program_is_made_small(episode: Made, tmp_path: Path, large: bool) -> None:
+@pytest.mark.parametrize(
+    ("success", "fail", "last", "once", "outcome"),
+    [
+        ([1, 1, 0, 0], [0, 1, 0, 0], (False, False), (True, True), "no success"),
+        ([1, 0, 0, 1], [0, 0, 0, 1], (True, True), (True, True), "success"),
+        ([0, 0, 0, 0], [1, 0, 0, 1], (False, True), (False, True), "fail"),
+        (None, [0, 0, 0, 0], (None, False), (None, False), "no success"),
+    ],
+)
+def test_an_outcome_is_told_of_the_last_state_and_of_any(
+    make_episode: Maker,
+    tmp_path: Path,
+    success: list[int] | None,
+    fail: list[int],
+    last: tuple[bool | None, bool],
+    once: tuple[bool | None, bool],
+    outcome: str,
+) -> None:
+    flags = {"success": success, "fail": fail}
+    evaluate = {name: np.array(flag, bool) for name, flag in flags.items() if flag is not None}
+    recovered = dataclasses.replace(make_episode().info, recovered=True)
+    files = make_episode(3, info=recovered, evaluate=evaluate).write(tmp_path)
+    described = json.loads(files.json.read_bytes())["workbench"]
+    assert (described["success"], described["fail"]) == last
+    assert (described["success_once"], described["fail_once"]) == once
+    facts, _ = row_of(tmp_path)
+    assert (facts.success, facts.fail, facts.success_once, facts.recovered) == (*last, once[0], True)
+    (title,) = read_rrd(files.rrd)["/__properties"]["RecordingInfo:name"].values[0]
+    assert title.endswith(f": {outcome}, 3 steps")
+    seen = {name: flag.tolist() for name, flag in read_episode(files.json).flags.items()}
+    assert seen == {name: flag.tolist() for name, flag in evaluate.items()}
+    for suffix, other in ((".rrd", ".h5"), (".h5", ".rrd")):
+        files.json.with_suffix(suffix).rename(tmp_path / "away")
+        problem = row_of(tmp_path)[0].problem
+        assert problem is not None and f"{files.json.stem}{suffix}" in problem and other not in problem
+        if suffix == ".rrd":
+            # The file of the states lacks the flags of the first state.
+            seen = {name: flag[1:].tolist() for name, flag in read_episode(files.json).flags.items()}
+            assert seen == {name: flag[1:].tolist() for name, flag in evaluate.items()}
+        (tmp_path / "away").rename(files.json.with_suffix(suffix))
+    assert row_of(tmp_path)[0].problem is None
+
+
+@pytest.mark.parametrize(
+    ("size", "form", "small"),
+    [((60, 90), "PNG", (60, 90)), ((600, 900), "JPEG", (64, 96)), ((150, 180), "JPEG", (80, 96))],
+)
+def test_a_thumbnail_of_another_program_is_made_small(
+    episode: Made, tmp_path: Path, size: tuple[int, int], form: str, small: tuple[int, int]
+) -> None:
     files = episode.write(tmp_path / "recordings")
     document: dict[str, Any] = json.loads(files.json.read_bytes())
-    noise = np.random.default_rng(0).integers(0, 255, (900, 600, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
     content = io.BytesIO()
-    Image.fromarray(noise if large else noise[:90, :60]).save(content, "JPEG" if large else "PNG")
+    Image.fromarray(noise).save(content, form)
     encoded = "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
     document["workbench"]["thumbnail"] = encoded
     files.json.write_text(json.dumps({**document, "workbench_checksum": None}))
     _, picture = row_of(files.json.parent)
     assert picture is not None
     image = Image.open(io.BytesIO(picture))
-    assert image.format == "JPEG" and image.size == ((64, 96) if large else (60, 90))
+    assert image.format == "JPEG" and image.size == small

@@ -19,7 +19,7 @@ from workbench.episodes.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.episodes.episode import NO_SEED, BrokenFile, CameraTrack, Episode
 from workbench.episodes.films import MAX_FRAMES, FilmPart
 from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
-from workbench.episodes.lerobot.format import Choice, frames_of
+from workbench.episodes.lerobot.format import Choice, frames_of, picture_stats
 from workbench.episodes.lerobot.read import lerobot_rows, read_lerobot
 from workbench.episodes.reader.reading import read_recording
 from workbench.episodes.row import UnreadableRecording
@@ -338,6 +338,14 @@ def test_a_dataset_has_one_library_row_per_episode(
         assert len(lerobot_rows(tmp_path / "sets" / "push")) == 2
     finally:
         library.close()
+
+
+def test_a_large_picture_is_thinned_for_its_statistics_as_in_lerobot() -> None:
+    row = np.arange(600, dtype=np.uint16) % 251
+    picture = np.broadcast_to(row[:, None, None], (600, 30, 3)).astype(np.uint8)
+    stats = picture_stats([picture, picture])
+    assert np.ravel(stats["mean"]) == pytest.approx([picture[::4].mean() / 255] * 3) and stats["count"] == [2]
+    assert np.ravel(stats["max"]) == pytest.approx([picture[::4].max() / 255] * 3)
 
 
 def test_a_playlist_as_video_reads_no_other_file(episode: Episode, tmp_path: Path) -> None:
