@@ -51,6 +51,36 @@ def test_files_named_in_the_task_and_in_those_files_are_recorded(task: Path) -> 
     assert side_files(str(task), {str(task): "not python ("}) == {}
 
 
+def test_only_files_of_the_authors_own_folder_are_recorded(tmp_path: Path) -> None:
+    names = ["a/ARM.URDF", "a/hand.stl", ".hidden/b.csv", ".c.csv", "d.csv", "d.rrd", "d.h5", "f.py", "g.csv"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("hand.stl" if name == "a/ARM.URDF" else name)
+    task, arm = str(tmp_path / "task.py"), {"a/ARM.URDF", "a/hand.stl"}
+    assert set(side_files(task, {"": f"names = {[*names, 'none.csv']!r}"})) == {*arm, "g.csv"}
+    for text in ("load('ARM.URDF')", "load('a')", "load('./a/ARM.URDF')"):
+        assert set(side_files(task, {"": text})) == arm, text
+    assert side_files(task, {"": "'g.csv is only mentioned'\n'g.csv'\n"}) == {}
+    installed = tmp_path / "lib" / "site-packages" / "tasks"
+    installed.mkdir(parents=True)
+    (installed / "g.csv").write_text("")
+    assert side_files(str(installed / "task.py"), {"": "load('g.csv')"}) == {}
+    assert side_files("task.py", {"": "load('g.csv')"}) == {}
+
+
+def test_many_changed_files_are_named_in_part_and_counted(tmp_path: Path) -> None:
+    for k in range(6):
+        (tmp_path / f"{k}.csv").write_text("then")
+    (tmp_path / "task.py").write_text("")
+    recorded = side_files(str(tmp_path / "task.py"), {"": f"load({[f'{k}.csv' for k in range(6)]!r})"})
+    assert list(recorded) == [f"{k}.csv" for k in range(6)] and len(set(recorded.values())) == 1
+    for k in range(1, 6):
+        (tmp_path / f"{k}.csv").write_text("now, and longer")
+    text = side_files_text(str(tmp_path / "task.py"), recorded)
+    assert "0.csv, 1.csv, 2.csv and 3 more" in text and "2 more differ" in text
+    assert "0.csv has" not in text and "3.csv has" in text and "4.csv has" not in text
+
+
 def test_changed_and_missing_side_files_are_reported(task: Path) -> None:
     text = "load('meshes/part.obj', 'notes.txt')"
     recorded = side_files(str(task), {str(task): text})

@@ -9,13 +9,16 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.drive.episodes import entries_of
+from tests.drive.scenes import table_scene
 from tests.drive.waiting import until
 from tests.episodes.refused_calls import descriptors, left_open, refused
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.episodes.writing import journal as journals
-from workbench.episodes.writing.journal import Journal, JournalEntry, claim
+from workbench.episodes.writing.journal import Journal, JournalEntry, claim, read_visuals, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -157,6 +160,70 @@ def test_threads_write_all_journals_and_end_with_the_last(
     for thread in threads:
         thread.join(20)
         assert not thread.is_alive()
+
+
+def test_rows_that_are_held_back_are_added_before_each_write_until_their_owner_is_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journals, "_journal_threads", type(journals._journal_threads)())
+    monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
+
+    class Batch:
+        def __init__(self, value: bytes) -> None:
+            self.held = [value]
+
+        def flush(self) -> None:
+            while self.held:
+                journal.append(JournalEntry("row", 0, self.held.pop()))
+
+    first, second = Batch(b"1"), Batch(b"2")
+    journals.before_writing(first.flush)
+    journals.before_writing(second.flush)
+    del first
+    journal = Journal(tmp_path / "a.arrow")
+    until(lambda: b"".join(rows(journal.path)) == b"2", "what the second held is written")
+    second.held.append(b"3")
+    until(lambda: b"".join(rows(journal.path)) == b"23", "what it held later too")
+    journal.close()
+
+
+def test_meshes_are_written_once_for_the_episodes_of_a_scene_in_a_folder(tmp_path: Path) -> None:
+    scene, other = table_scene(1)[0], table_scene(2)[0]
+    paths = [tmp_path / name / "a.scene" for name in ("one", "two")]
+    paths += [tmp_path / "one" / "b.scene", tmp_path / "one" / "c.scene"]
+    for path, geometry in zip(paths, (scene, scene, scene, other)):
+        path.parent.mkdir(exist_ok=True)
+        write_scene(geometry, path)
+        assert len(read_visuals(path)) == len(geometry.visuals)
+        assert read_visuals(path)[-1].envs.tolist() == geometry.visuals[-1].envs.tolist()
+    first, apart, second, third = (path.stat() for path in paths)
+    assert len({first.st_ino, apart.st_ino, second.st_ino, third.st_ino}) == 4
+    # Of two episodes of one scene in one folder, one after the other, the second links the first's file.
+    write_scene(other, tmp_path / "one" / "d.scene")
+    paths[3].unlink()
+    write_scene(other, tmp_path / "one" / "e.scene")
+    linked = {(tmp_path / "one" / f"{name}.scene").stat().st_ino for name in "de"}
+    assert linked == {third.st_ino}
+
+
+def test_a_scene_is_read_back_with_all_its_numbers(tmp_path: Path) -> None:
+    numbers = np.arange(9, dtype=np.float32).reshape(3, 3)
+    mesh = Mesh(numbers, np.array([[2, 0, 1]], np.uint32), numbers + 1, numbers[:, :2] + 2)
+    look = Material((0.1, 0.2, 0.3, 0.4), 0.5, 0.6, np.full((1, 2, 4), 7, np.uint8))
+    envs, bodies = np.array([0, 1], np.int32), np.array([1, 0], np.int32)
+    plain = Visual("plain", Mesh(numbers, mesh.faces), Material((1, 1, 1, 1)), envs[:1], bodies[:1])
+    kinds = ("static", "dynamic")
+    visuals = (Visual("a/b", mesh, look, envs, bodies), plain)
+    write_scene(SceneGeometry(2, ("a", "b"), kinds, (False, True), visuals), tmp_path / "a.scene")
+    found = read_visuals(tmp_path / "a.scene")
+    assert [visual.name for visual in found] == ["a/b", "plain"]
+    for now, then in zip(found, visuals):
+        for name in ("vertices", "faces", "normals", "uvs"):
+            np.testing.assert_array_equal(getattr(now.mesh, name), getattr(then.mesh, name))
+        for name in ("base_color", "metallic", "roughness", "texture"):
+            np.testing.assert_array_equal(getattr(now.material, name), getattr(then.material, name))
+        np.testing.assert_array_equal(now.envs, then.envs)
+        np.testing.assert_array_equal(now.bodies, then.bodies)
 
 
 def test_rows_are_still_written_while_a_sync_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
