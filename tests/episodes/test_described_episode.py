@@ -167,6 +167,15 @@ def test_every_field_is_read_back_with_and_without_the_other_files(
     assert_as_recorded(read_episode(files.rrd), episode, "push.py")
 
 
+def test_a_return_that_is_no_number_is_shown_as_that(make_episode: Maker, tmp_path: Path) -> None:
+    files = make_episode(3, reward=np.array([1, np.nan, 2], np.float32)).write(tmp_path)
+    facts, _ = row_of(tmp_path)
+    assert facts.problem is None and facts.total_reward is not None and np.isnan(facts.total_reward)
+    assert files.json.read_text().startswith("{\n  ") and read_episode(files.json).broken_files == ()
+    write_into_description(files.json, ("odd",), "")
+    assert files.json.read_text().startswith("{\n  ") and row_of(tmp_path)[0].tags == ("odd",)
+
+
 def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
     episode: Made, tmp_path: Path
 ) -> None:

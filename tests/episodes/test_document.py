@@ -136,6 +136,15 @@ def test_the_task_file_with_the_longest_matching_path_above_the_recording_is_fou
     assert task_file(path, "Push-v1", moved) == beside
     here = put(Path.cwd() / "tasks" / "push.py")
     assert task_file(path, "Push-v1", moved) == here, "the folder where the search starts comes first"
+    put(moved / "notes.txt")
+    assert task_file("../../me/notes.txt", "Push-v1", moved) is None, "it is no program"
+    assert task_file("d/" * 40 + "push.py", "Push-v1", moved) is None, (
+        "it has too many parts to be searched for"
+    )
+    assert task_file("d/" * 39 + "push.py", "Push-v1", moved) == beside
+    given = put(moved.parent / "given.py", "of any content")
+    assert task_file("../given.py", "Push-v1", moved) == given, "the recorded path itself is believed"
+    assert task_file(None, "Push-v1", moved) is task_file("", "Push-v1", moved) is None
 
 
 # --- checksums -------------------------------------------------------------------------------------

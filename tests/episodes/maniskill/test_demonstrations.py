@@ -278,7 +278,9 @@ def test_episodes_that_fail_or_do_not_fit_are_left_out_on_request(tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "a.json"]
 
 
-def test_the_library_lists_each_episode_with_its_own_numbers_and_last_picture(tmp_path: Path) -> None:
+def test_the_library_lists_each_episode_with_its_own_numbers_and_last_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     given = [episode_of(4, 0), episode_of(6, 5, success_from=3)]
     given[1].evaluate["fail"] = np.arange(7) > 4
     given[0].evaluate["fail"] = np.zeros(5, bool)
@@ -297,6 +299,10 @@ def test_the_library_lists_each_episode_with_its_own_numbers_and_last_picture(tm
     assert [
         (facts.total_reward, picture) for facts, picture in read_found(tmp_path, found, only_names=True)
     ] == [(None, None)] * 2
+    with monkeypatch.context() as patch:
+        patch.setattr("workbench.episodes.reader.read_rows.MAX_EPISODES", 1)
+        (first, more) = [facts for facts, _ in read_found(tmp_path, found)]
+    assert first.trajectory == "traj_0" and more.trajectory is None and more.problem is not None
     with h5py.File(tmp_path / "demos.h5", "a") as file:
         del file["traj_0"]
         file.create_group("traj_9")

@@ -191,9 +191,9 @@ def test_linked_files_and_a_folder_that_was_made_again_are_read(tmp_path: Path) 
 
 
 def test_a_recording_is_named_to_reruns_viewer_by_its_own_id(tmp_path: Path) -> None:
-    path = write(tmp_path, made(1, task="A:b-v1"), pictures=False).with_suffix(".rrd")
+    path = write(tmp_path, made(1, task="A:b/c-v1"), pictures=False).with_suffix(".rrd")
     (store,) = RrdReader(path).recordings()
-    assert reading.read_store_id(path) == f"Recording:workbench A\\:b-v1:{store.recording_id}"
+    assert reading.read_store_id(path) == f"Recording:workbench A\\:b-c-v1:{store.recording_id}"
     (tmp_path / "none.rrd").write_bytes(b"")
     with pytest.raises(UnreadableRecording, match="none"):
         reading.read_store_id(tmp_path / "none.rrd")
