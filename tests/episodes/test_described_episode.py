@@ -194,8 +194,15 @@ def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
         if state == 3:
             writer.placed(("human", "view"), None)
             writer.acted_by("policy")
-        append(writer, row)
+        # In another order than the cameras were announced.
+        append(writer, dataclasses.replace(row, pictures=row.pictures[::-1]))
     files = writer.finish()
+    for track in read_episode(files.json).cameras:
+        assert track.rgb is not None
+        first = 20 if track.info.name == "eye" else 100
+        shades = [round(float(track.rgb[k].mean())) for k in range(len(track.rgb))]
+        assert shades == pytest.approx([first + 10 * state for state in track.frame], abs=2)
+        assert track.pose[:, 1].tolist() == pytest.approx([first] * len(track.frame))
     moved = (
         MovedCamera(1, "human", "view", settings(6.0), settings(5.0)),
         MovedCamera(2, "sensor", "eye", settings(1.0), settings(2.0)),

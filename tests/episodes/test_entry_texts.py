@@ -94,14 +94,15 @@ def test_numbers_texts_and_both_are_read_back(
 
 def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Path) -> None:
     write(
-        make_episode(3),
+        make_episode(4),
         tmp_path,
-        [{"phase": text_entry(f"{state // 2}")} for state in range(4)],
+        [*({"phase": text_entry(f"{state // 2}")} for state in range(4)), {}],
         finish=False,
     )
     (files,) = recover(tmp_path)
     episode = read_episode(files.json)
     assert episode.info.recovered
+    assert episode.other_entries_at(4) == {}, "the last state has no entries"
     assert [episode.other_entries_at(state)["phase"].texts for state in range(4)] == [
         ("0",),
         ("0",),

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from tests.live.recorded_runs import Recorded, opened, reaching, record
-from workbench.episodes.recorded_state import read_states, state_distance
-from workbench.episodes.replay import replay_to
+from workbench.envs.evaluate_entries import flat_entries
+from workbench.envs.recorded_run import RecordedRun
+from workbench.episodes.recorded_state import read_states, state_distance, write_states
+from workbench.episodes.replay import begin_run, replay_to, restore_recorded
 from workbench.task.open import OpenedTask
 from workbench.task.problem import TaskError
 
@@ -134,6 +136,90 @@ def test_a_seed_begins_the_same_episode_in_every_env_of_a_batch(task: OpenedTask
     again = {name: rows[2] for name, rows in read_states(task.env.env).items()}
     for name in first:
         assert np.array_equal(first[name], again[name]), name
+
+
+def test_each_env_begins_its_own_run_and_gets_its_own_state(task: OpenedTask, recorded: Recorded) -> None:
+    record(task, 3, [1, 2, 3], reaching(3, N))
+    before = {name: rows.copy() for name, rows in read_states(task.env.env).items()}
+    runs = {0: recorded.run(2), 2: recorded.run(0)}
+    moved = {name: rows.copy() for name, rows in runs[2].env_states.items()}
+    moved["actors/cube"][0, 0] += 0.05  # its reset leads elsewhere
+    runs[2] = replace(runs[2], env_states=moved)
+    begun = begin_run(task.loaded, task.env, runs)
+    assert {env: (one.differs, one.missed) for env, one in begun.items()} == {0: (False, {}), 2: (True, {})}
+    assert [task.env.episode_seeds[env] for env in (0, 1, 2)] == [5, 2, 31]
+    for wanted in (
+        {env: run.state(0) for env, run in runs.items()},
+        {0: runs[0].state(9), 2: runs[2].state(20)},
+    ):
+        now = read_states(task.env.env)
+        for name, rows in now.items():
+            assert np.array_equal(rows[1], before[name][1]), name
+            for env, state in wanted.items():
+                np.testing.assert_allclose(rows[env], state[name], atol=1e-6, err_msg=name)
+        step = restore_recorded(task, {0: runs[0].state(9), 2: runs[2].state(20)})
+    assert step.poses.shape[0] == N
+    unseeded = begin_run(task.loaded, task.env, {1: replace(recorded.run(1), seed=-1)})
+    assert len(unseeded[1].missed) == 1 and unseeded[1].differs
+
+
+def test_actions_that_are_no_numbers_are_not_taken(task: OpenedTask, recorded: Recorded) -> None:
+    action = recorded.run(1).action.copy()
+    action[3] = np.nan
+    done: list[int] = []
+    _, result = replay_to(task, replace(recorded.run(1), action=action), 10, [0, 2], done.append)
+    assert result.way == "put there" and result.missed.keys() == {"the way there"} and done == []
+    now = read_states(task.env.env)
+    for env in (0, 2):
+        here = {name: rows[env] for name, rows in now.items()}
+        assert state_distance(here, recorded.run(1).state(10))[0] < 1e-6
+    _, result = replay_to(task, recorded.run(1), 4, [0, 2], done.append)
+    assert (result.way, done) == ("re-simulated", [1, 2, 3, 4])
+    for state, envs in ((STEPS + 1, [0]), (-1, [0]), (3, []), (3, [N])):
+        with pytest.raises(IndexError):
+            replay_to(task, recorded.run(1), state, envs)
+    assert replay_to(task, recorded.run(1), STEPS, [1])[1].metres == 0
+
+
+PLACED = """
+import torch
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Pose
+
+
+@register_env("PlacedByOptions-v1", max_episode_steps=9, override=True)
+class PlacedEnv(PushCubeEnv):
+    def _initialize_episode(self, env_idx, options):
+        super()._initialize_episode(env_idx, options)
+        place = torch.tensor([[options.get("x", 0.0), 0.0, 0.02]]).repeat(len(env_idx), 1)
+        self.obj.set_pose(Pose.create_from_pq(p=place))
+"""
+
+
+def test_the_recorded_options_of_the_reset_and_targets_of_controllers_are_restored(tmp_path: Path) -> None:
+    file = tmp_path / "placed.py"
+    file.write_text(PLACED)
+    task = opened(str(file), N, control_mode="pd_joint_target_delta_pos")
+    options = {"x": 0.3, "env_idx": [0], "reconfigure": True}
+    plain = RecordedRun("r", 3, options, np.zeros((0, 8), np.float32), {})
+    begun = begin_run(task.loaded, task.env, {1: plain})
+    assert read_states(task.env.env)["actors/cube"][:, 0].tolist() == pytest.approx([0, 0.3, 0])
+    assert len(begun[1].missed) == 1 and options == {"x": 0.3, "env_idx": [0], "reconfigure": True}
+
+    def targets() -> dict[str, np.ndarray]:
+        held = flat_entries(task.env.env.agent.get_controller_state(), "controller")
+        return {name: value.cpu().numpy().copy() for name, value in held if value is not None}
+
+    before = targets()
+    assert any(rows.shape[1:] == (7,) for rows in before.values())
+    states = {name: rows[1] + np.float32(0.25) for name, rows in before.items()}
+    write_states(task.env.env, {0: {name: row + np.float32(0.5) for name, row in states.items()}, 1: states})
+    for name, rows in targets().items():
+        np.testing.assert_array_equal(rows[0], before[name][1] + np.float32(0.25) + np.float32(0.5))
+        np.testing.assert_array_equal(rows[1], before[name][1] + np.float32(0.25))
+        np.testing.assert_array_equal(rows[2], before[name][2])
+    task.env.close()
 
 
 def test_an_error_of_the_task_during_replay_has_its_own_line(tmp_path: Path) -> None:

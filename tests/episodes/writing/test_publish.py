@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.episodes.refused_calls import descriptors, left_open, refused
-from workbench.episodes.writing.publish import publish, sync_files
+from workbench.episodes.writing.publish import RecordingError, publish, reason, sync_files, try_folder
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -86,3 +88,36 @@ def test_whatever_call_fails_all_three_have_names_or_none_has(
             assert names(folder) == [], call
         if links:
             assert all(path.exists() for path in paths), call
+
+
+def test_each_kind_of_disk_error_has_advice_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def why(number: int) -> str:
+        return reason(OSError(number, os.strerror(number)), tmp_path)
+
+    alike = [
+        (errno.ENOSPC, errno.EDQUOT),
+        (errno.EACCES, errno.EPERM, errno.EROFS),
+        (errno.ENOTDIR, errno.EEXIST),
+        (errno.ENAMETOOLONG,),
+        (errno.EFBIG,),
+        (errno.ENOENT,),
+        (errno.EIO,),
+    ]
+    told = [{why(number) for number in numbers} for numbers in alike]
+    assert all(len(texts) == 1 for texts in told) and len(set.union(*told)) == len(alike)
+    assert why(errno.EIO) == f"{os.strerror(errno.EIO)}." and str(tmp_path) in why(errno.ENOENT)
+    full = why(errno.ENOSPC)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    assert why(errno.EIO) == full, "a full disk may show in another way"
+
+
+def test_a_folder_is_tried_before_a_recording_without_making_it(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    try_folder(tmp_path / "new" / "deeper")
+    try_folder(tmp_path)
+    for refused_folder in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / os.fsdecode(b"\xff")):
+        with pytest.raises(RecordingError):
+            try_folder(refused_folder)
+    assert names(tmp_path) == ["file"] and len(list(tmp_path.iterdir())) == 1
