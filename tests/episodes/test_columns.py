@@ -101,3 +101,18 @@ def test_a_batch_is_packed_like_its_single_envs() -> None:
         )
         assert packed(by_hand, packer, 4) == (layout, rows[env])
     assert packer.pack(together)[0] is layout
+
+
+def test_batches_of_changing_size_and_entries_are_packed_each_for_itself() -> None:
+    packer = BatchPacker()
+    seen = []
+    for count, more in ((3, False), (2, False), (2, True), (3, False), (3, False)):
+        numbers = np.arange(count, dtype=np.float32)[:, None] + 10 * len(seen)
+        columns = [("poses", numbers), *([("evaluate/more", numbers[:, 0] > 11)] if more else [])]
+        layout, rows = packer.pack(columns)
+        seen.append(layout)
+        assert len(rows) == count
+        for env, row in enumerate(rows):
+            (found,) = np.frombuffer(row, layout_type(layout.text))
+            assert found["poses"].tolist() == [10 * (len(seen) - 1) + env]
+    assert seen[0] is seen[1] is seen[3] is seen[4] is not seen[2], "a layout is written once"

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from workbench.episodes.encoded_pictures import EncodedPictures, encode
+from workbench.episodes.encoded_pictures import EncodedPictures, LazyPictures, encode, small_jpeg
 
 SHAPE = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
 
@@ -48,6 +48,43 @@ def test_colour_keeps_rows_and_channels_apart() -> None:
     found = EncodedPictures("rgb", [encode("rgb", image)])[-1]
     assert found.shape == image.shape
     assert np.abs(found.astype(int) - image).max() < 12
+
+
+def test_neighbouring_columns_keep_their_colours() -> None:
+    image = np.zeros((16, 16, 3), np.uint8)
+    image[:, ::2, 0] = image[:, 1::2, 2] = 220
+    found = EncodedPictures("rgb", [encode("rgb", image)])[0]
+    assert np.abs(found.astype(int) - image).mean() < 12
+
+
+def test_whole_numbers_are_distances_in_millimetres() -> None:
+    depth = np.array([[0, 1500], [65_535, 7]], np.int32)
+    np.testing.assert_allclose(EncodedPictures("depth", [encode("depth", depth)])[0], depth / 1000, rtol=1e-6)
+
+
+def test_pictures_are_read_by_any_index_and_no_more_than_asked() -> None:
+    asked: list[int] = []
+
+    def one(number: int) -> bytes:
+        asked.append(number)
+        return encode("segmentation", np.full((2, 3), number, np.int32))
+
+    pictures = EncodedPictures("segmentation", LazyPictures(5, one))
+    assert [int(pictures[index][0, 0]) for index in (3, -1, 0, -5)] == [3, 4, 0, 0] and asked == [3, 4, 0, 0]
+    assert len(pictures) == 5 and pictures.blob(-2) == one(3) and len(pictures.blobs[1:4]) == 3
+    far = EncodedPictures("segmentation", LazyPictures(5, one), lambda index: np.array([index]))
+    assert [far[index].tolist() for index in (2, -1)] == [[2], [4]]
+    for index in (5, -6):
+        for held in (pictures, far):
+            with pytest.raises(IndexError):
+                held[index]
+
+
+def test_a_small_picture_is_not_enlarged_and_a_large_one_keeps_its_shape() -> None:
+    for size, small in (((400, 100), (96, 24)), ((40, 30), (40, 30)), ((100, 400), (24, 96))):
+        image = Image.open(io.BytesIO(small_jpeg(Image.new("RGBA", size, (9, 200, 9, 255)), 96)))
+        assert (image.size, image.format) == (small, "JPEG")
+        assert np.abs(np.asarray(image).astype(int) - [9, 200, 9]).max() < 12
 
 
 def test_a_picture_with_too_many_pixels_or_of_another_format_is_refused() -> None:

@@ -55,7 +55,7 @@ def an_episode() -> Episode:
     track = CameraTrack(
         lens,
         np.arange(T + 1),
-        np.ones((T + 1, 7), np.float32),
+        np.arange((T + 1) * 7, dtype=np.float32).reshape(T + 1, 7),
         EncodedPictures("rgb", [encode("rgb", PICTURE)] * (T + 1)),
     )
     return Episode(
@@ -121,6 +121,9 @@ def test_an_episode_is_equal_after_the_transfer() -> None:
     assert (first.material.metallic, first.material.roughness) == (0.25, 0.75)
     (track,) = episode.cameras
     assert track.info.key == ("sensor", "eye") and track.depth is None and track.rgb is not None
+    np.testing.assert_array_equal(track.frame, there.cameras[0].frame, strict=True)
+    np.testing.assert_array_equal(track.pose, there.cameras[0].pose, strict=True)
+    assert (track.info.near, track.info.far, track.info.width, track.info.height) == (0.01, 10.0, 6, 4)
     assert len(track.rgb) == T + 1 and track.rgb.blob(-1) == encode("rgb", PICTURE)
     np.testing.assert_array_equal(track.rgb[2], PICTURE + 2)
 
@@ -215,6 +218,12 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
         (of_first("cameras", frame=numbers(T + 1)), "eye: frames of shape"),
         (of_first("cameras", pose=numbers(T, 7)), "eye: poses of shape"),
         (of_first("cameras", pictures={"rgb": T}), "4 frames and 3 pictures"),
+        (of_first("cameras", pictures={"rgb": T + 2}), "4 frames and 5 pictures"),
+        (of_first("shapes", "mesh", faces=numbers(1, 3)), "faces of shape"),
+        (of_first("shapes", "mesh", faces=np.array([[0, 1, -1]])), "vertices that do not exist"),
+        (of_first("shapes", "mesh", uvs=numbers(2, 2)), "uvs of shape"),
+        (of_first("shapes", "material", texture=numbers(2, 2, 4)), "a texture of shape"),
+        (of_scene(body_hidden=(False,)), "different number of bodies"),
     ],
 )
 def test_inconsistent_data_is_refused_with_a_message(

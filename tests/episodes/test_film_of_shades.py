@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import ImageDraw
 
 from tests.drive.episodes import geometry_of, made, poses_of
 from workbench.envs.camera_data import CameraInfo, CameraKind
@@ -137,6 +139,41 @@ def test_each_cell_of_a_sheet_is_the_picture_of_its_camera_and_state() -> None:
         for one, other in ((1, 0), (0, 1))
     )
     assert green[1] > 20 and green[0] == green[2] == 0 and red[2] > 20 and red[0] == red[1] == 0
+
+
+def test_the_texts_of_a_sheet_tell_step_time_and_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    draw = ImageDraw.ImageDraw.text
+
+    def text(self: ImageDraw.ImageDraw, xy: tuple[float, float], text: str, **how: Any) -> None:
+        written.append(text)
+        draw(self, xy, text, **how)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
+    plain = replace(
+        made(6, seed=0, control_dt=0.04), cameras=[camera("eye", "sensor", range(7), 10)], evaluate={}
+    )
+    contact_sheet(plain, columns=4)
+    title, name, *labels = written
+    assert {"Push-v1", "seed", "0", "6", "21.00"} <= set(title.split()) and "success" not in title
+    assert name == "eye" and [label.split()[1:3] for label in labels] == [
+        ["0", "0.00"],
+        ["2", "0.08"],
+        ["4", "0.16"],
+        ["6", "0.24"],
+    ]
+    for ends, last in ((np.arange(7) >= 4, "success"), (np.arange(7) == 4, "no success")):
+        written.clear()
+        contact_sheet(replace(plain, evaluate={"success": ends}), columns=4)
+        assert written[0].endswith(f"   {last}") and ["success" in label for label in written[2:]] == [
+            False,
+            False,
+            True,
+            False,
+        ]
+    written.clear()
+    contact_sheet(replace(plain, info=replace(plain.info, seed=-1)), columns=4)
+    assert "seed" not in written[0]
 
 
 def test_a_recorded_camera_for_people_films_the_scene_from_its_place() -> None:
