@@ -190,6 +190,15 @@ def test_linked_files_and_a_folder_that_was_made_again_are_read(tmp_path: Path) 
     assert reading.read_recording(Source(again)).length == 5
 
 
+def test_a_reading_that_is_no_longer_needed_is_given_up_and_the_next_one_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path, made(2))
+    with pytest.raises(UnreadableRecording, match=path.stem):
+        reading.read_recording(Source(path), stopped=lambda: True)
+    assert reading.read_recording(Source(path)).length == 2
+    with pytest.raises(UnreadableRecording, match="as it is"):
+        reading.read_recording(Source(path, problem="It is damaged as it is."))
+
+
 def test_a_recording_is_named_to_reruns_viewer_by_its_own_id(tmp_path: Path) -> None:
     path = write(tmp_path, made(1, task="A:b/c-v1"), pictures=False).with_suffix(".rrd")
     (store,) = RrdReader(path).recordings()

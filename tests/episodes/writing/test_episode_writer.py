@@ -8,6 +8,7 @@ import os
 import re
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -196,13 +197,31 @@ def test_file_names_are_safe_on_any_file_system(task: str, seed: int, env: int) 
     assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,150}", stem)
 
 
+def test_a_file_name_tells_task_seed_env_and_local_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    info = dataclasses.replace(
+        INFO, task="a/b v1", seed=3, env_index=2, written_at="2026-11-21T08:15:30+00:00"
+    )
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    time.tzset()
+    try:
+        assert episode_stem(info) == "a-b-v1_seed0003_env02_2026-11-21T17-15-30"
+        assert episode_stem(dataclasses.replace(info, seed=0)).startswith("a-b-v1_seed0000_env02_")
+        assert episode_stem(dataclasses.replace(info, seed=-1)).startswith("a-b-v1_noseed_env02_")
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
 def test_a_row_is_copied_from_the_batch(make_episode: Maker, tmp_path: Path) -> None:
     episode = make_episode()
     poses = episode.poses[0].copy()
     writer = episode.writer(tmp_path)
     append(writer, EpisodeRow(poses))
     poses[:] = -1
-    found = read_episode(writer.finish().json)
+    assert len(writer) == 0
+    files = writer.finish()
+    assert writer.finish() == files and len(left(tmp_path)) == 3
+    found = read_episode(files.json)
     assert found.poses is not None
     np.testing.assert_array_equal(found.poses[0], episode.poses[0])
 

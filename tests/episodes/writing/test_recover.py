@@ -23,7 +23,7 @@ from tests.episodes.refused_calls import descriptors, left_open, refused
 from workbench.envs.scene.shapes import Mesh
 from workbench.envs.task_drawings import Drawing
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.writing.finish_or_recover import recover
+from workbench.episodes.writing.finish_or_recover import recover, remove_episode
 from workbench.episodes.writing.journal import FOLDER, Journal, JournalEntry
 from workbench.episodes.writing.publish import RecordingError
 
@@ -284,3 +284,18 @@ def test_an_unrecoverable_journal_is_reported_and_kept_and_the_others_are_recove
         assert read_episode(path).length == 4
         assert sorted(path.name for path in (tmp_path / FOLDER).iterdir()) == ["0.arrow", "0.scene"]
     assert left_open(before) == []
+
+
+def test_only_the_traces_of_one_episode_are_removed(make_episode: Maker, tmp_path: Path) -> None:
+    for id in ("1", "2"):
+        left(make_episode(2), tmp_path, id=id)
+    assert len(recover(tmp_path)) == 2
+    for id in ("3", "33"):
+        left(make_episode(3), tmp_path, id=id)
+    remove_episode(tmp_path, "Made-v1", 8, "1")
+    remove_episode(tmp_path, "Made-v1", 7, "2")
+    remove_episode(tmp_path, "Made-v1", 7, "3")
+    remove_episode(tmp_path, "Made-v1", 7, "none")
+    assert {path.stem for path in (tmp_path / FOLDER).iterdir()} == {"33"}
+    assert len(recover(tmp_path)) == 1
+    assert lengths(tmp_path) == {"1": 2, "33": 3}
