@@ -293,11 +293,16 @@ def test_a_dataset_of_another_program_is_read(episode: Episode, tmp_path: Path) 
     features["action"]["names"] = ["too few"]
     write_info()
     assert read_lerobot(folder, 1).action_names == ("action[0]", "action[1]")
+    # Files that could be read if they were not outside of the dataset.
+    shutil.copyfile(folder / "data/chunk-000/file-000.parquet", tmp_path / "other.parquet")
+    shutil.copyfile(next(folder.rglob("*.mp4")), tmp_path / "other.mp4")
     for change in (
         {"codebase_version": "v2.1"},
         {"fps": 0},
         {"features": []},
         {"data_path": "../other.parquet"},
+        {"video_path": "../other.mp4"},
+        {"data_path": str(tmp_path / "other.parquet")},
     ):
         write_info(**change)
         with pytest.raises(UnreadableRecording, match="set"):
