@@ -14,8 +14,8 @@ import pytest
 from tests.live.recorded_runs import Recorded, opened, reaching, record
 from workbench.envs.evaluate_entries import flat_entries
 from workbench.envs.recorded_run import RecordedRun
-from workbench.episodes.recorded_state import read_states, state_distance, write_states
-from workbench.episodes.replay import begin_run, replay_to, restore_recorded
+from workbench.episodes.recorded_state import read_states, state_distance, state_mismatches, write_states
+from workbench.episodes.replay import ReplayResult, begin_run, replay_text, replay_to, restore_recorded
 from workbench.task.open import OpenedTask
 from workbench.task.problem import TaskError
 
@@ -163,6 +163,32 @@ def test_each_env_begins_its_own_run_and_gets_its_own_state(task: OpenedTask, re
     assert len(unseeded[1].missed) == 1 and unseeded[1].differs
 
 
+def test_parts_of_a_state_that_do_not_fit_are_named_and_stay(task: OpenedTask, recorded: Recorded) -> None:
+    env, state = task.env.env, recorded.run(1).state(20)
+    cube = state["actors/cube"]
+    lacking = {name: value for name, value in state.items() if name != "actors/cube"}
+    for changed, missed in (
+        (state, set()),
+        (lacking, {"actors/cube"}),
+        ({**state, "actors/cube": np.zeros(14, np.float32)}, {"actors/cube"}),
+        ({**state, "actors/cube": np.full(13, np.nan, np.float32)}, {"actors/cube"}),
+        (
+            {**state, "actors/other": cube, "articulations/other": cube},
+            {"actors/other", "articulations/other"},
+        ),
+        ({**state, "actors/other": np.full(13, np.nan, np.float32), "controller/arm": cube}, set()),
+    ):
+        assert state_mismatches(env, 1, changed).keys() == missed
+    begin_run(task.loaded, task.env, {1: recorded.run(0)})
+    before = {name: rows.copy() for name, rows in read_states(env).items()}
+    write_states(env, {1: lacking})
+    now = read_states(env)
+    np.testing.assert_array_equal(now["actors/cube"], before["actors/cube"])
+    np.testing.assert_allclose(now["articulations/panda"][1], state["articulations/panda"], atol=1e-6)
+    for other in (0, 2):
+        np.testing.assert_array_equal(now["articulations/panda"][other], before["articulations/panda"][other])
+
+
 def test_actions_that_are_no_numbers_are_not_taken(task: OpenedTask, recorded: Recorded) -> None:
     action = recorded.run(1).action.copy()
     action[3] = np.nan
@@ -179,6 +205,24 @@ def test_actions_that_are_no_numbers_are_not_taken(task: OpenedTask, recorded: R
         with pytest.raises(IndexError):
             replay_to(task, recorded.run(1), state, envs)
     assert replay_to(task, recorded.run(1), STEPS, [1])[1].metres == 0
+
+
+def test_each_way_to_a_state_is_told_apart() -> None:
+    results = [
+        ReplayResult("put there", 20, 0.0, 0.0),
+        ReplayResult("corrected", 20, 0.0012, 0.0, corrected=3),
+        ReplayResult("re-simulated", 0, 0.0, 0.0),
+        ReplayResult("re-simulated", 0, 0.0, 0.0, start_differs=True),
+        ReplayResult("re-simulated", 20, 0.0, 0.0),
+        ReplayResult("re-simulated", 20, 0.0, 0.0, start_differs=True),
+        ReplayResult("re-simulated", 20, 0.0, 0.1),
+        ReplayResult("re-simulated", 20, None, None),
+    ]
+    texts = [replay_text(result) for result in results]
+    assert len(set(texts)) == len(texts)
+    assert "3 of 20" in texts[1] and "1.2 mm" in texts[1]
+    exact = [text.endswith("to the last bit.") for text in texts]
+    assert exact == [True, False, True, True, True, True, False, False]
 
 
 PLACED = """
