@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from tests.drive.episodes import Made, Track
+from tests.drive.rows import append
 from tests.episodes.read_rrd import read_rrd
 from workbench.envs.camera_data import CameraInfo, CameraKind, CameraSettings, MovedCamera
 from workbench.episodes.document import seen_otherwise, write_into_description
@@ -179,8 +180,6 @@ def test_a_return_that_is_no_number_is_shown_as_that(make_episode: Maker, tmp_pa
 def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
     episode: Made, tmp_path: Path
 ) -> None:
-    from tests.drive.rows import append
-
     for track in episode.cameras:
         track.info = dataclasses.replace(
             track.info, settings=settings(0.0 if track.info.name == "eye" else 5.0)
@@ -217,6 +216,14 @@ def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
     plain = dataclasses.replace(info, moved_cameras=(), observed_by="")
     assert seen_otherwise(plain) == {}
     assert "eye" in read_properties(files.rrd)["episode"]["moved_cameras"]
+
+
+def test_a_camera_without_settings_cannot_have_been_moved(episode: Made, tmp_path: Path) -> None:
+    writer = episode.writer(tmp_path)
+    writer.placed(("sensor", "eye"), settings(1.0))
+    for row in episode.rows():
+        append(writer, row)
+    assert read_episode(writer.finish().json).info.moved_cameras == ()
 
 
 @pytest.mark.parametrize(

@@ -252,6 +252,13 @@ def test_rows_are_still_written_while_a_sync_hangs(tmp_path: Path, monkeypatch: 
             journal.close()
 
 
+def test_many_bytes_are_written_at_once_and_not_kept_in_memory(journal: Journal) -> None:
+    journal.append(JournalEntry("row", 0, b"a"))
+    assert rows(journal.path) == []
+    journal.append(JournalEntry("row", 0, bytes(3 << 20)))
+    assert rows(journal.path) == [b"a" + bytes(3 << 20)]
+
+
 def test_pending_bytes_are_counted_until_they_are_written(journal: Journal) -> None:
     begin = journal.size
     made: Future[list[JournalEntry]] = Future()
