@@ -30,7 +30,8 @@ HEIGHT, WIDTH = 6, 8
 
 def camera_track(name: str, kind: CameraKind, states: int, first: int) -> CameraTrack:
     """A camera that turns at every second state and ends where it began; each picture tells its state, each pixel column differs."""
-    turns = Rotation.random(states, random_state=first).as_quat()[:, [3, 0, 1, 2]]
+    turns = np.random.default_rng(first).normal(size=(states, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     pose = np.concatenate([np.arange(3 * states).reshape(states, 3) + first, turns], axis=1).astype(
         np.float32
     )

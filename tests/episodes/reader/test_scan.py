@@ -17,7 +17,8 @@ LONG_AGO = time.time() - 1000
 def put(path: Path, content: str = "", age: float = 1000.0) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(content)
-    os.utime(path, (time.time() - age,) * 2)
+    at = time.time() - age
+    os.utime(path, (at, at))
     return path
 
 
@@ -81,7 +82,7 @@ def test_a_change_in_any_folder_is_noticed(folder: Path) -> None:
     changed = (
         lambda: put(folder / "in" / "more.json"),
         lambda: (folder / "in" / "d.h5").unlink(),
-        lambda: os.utime(folder, (LONG_AGO - 60,) * 2),
+        lambda: os.utime(folder, (LONG_AGO - 60, LONG_AGO - 60)),
         lambda: (folder / "in").rename(folder / "out"),
     )
     for change in changed:

@@ -23,9 +23,11 @@ Maker = Callable[..., Made]
 
 def mesh(first: float) -> Mesh:
     """A triangle with normals and texture coordinates, all numbers different."""
-    numbers = np.arange(3, dtype=np.float32)[:, None] + first
-    vertices = np.eye(3, dtype=np.float32) + numbers
-    return Mesh(vertices, np.array([[2, 0, 1]], np.uint32), numbers * [0, 0.1, 1], numbers * [0.25, 0.5])
+    numbers = np.arange(3)[:, None] + first
+    vertices, normals, uvs = np.eye(3) + numbers, numbers * [0, 0.1, 1], numbers * [0.25, 0.5]
+    faces = np.array([[2, 0, 1]], np.uint32)
+    single = np.float32
+    return Mesh(vertices.astype(single), faces, normals.astype(single), uvs.astype(single))
 
 
 def scene() -> SceneGeometry:
@@ -34,10 +36,9 @@ def scene() -> SceneGeometry:
     large[:50, :, 0], large[:, 100:, 2], large[..., 3] = 200, 160, 255
     small[..., 3] = 255
     both, zeros = np.array([1, 2], np.int32), np.zeros(2, np.int32)
-    look = {"metallic": 0.25, "roughness": 0.75}
-    shiny = Material((0.1, 0.2, 0.4, 0.5), **look)
+    shiny = Material((0.1, 0.2, 0.4, 0.5), 0.25, 0.75)
     visuals = (
-        Visual("floor/0", mesh(1.0), Material((1, 1, 1, 1), texture=large, **look), zeros[:1], zeros[:1]),
+        Visual("floor/0", mesh(1.0), Material((1, 1, 1, 1), 0.25, 0.75, large), zeros[:1], zeros[:1]),
         Visual("shared", mesh(2.0), shiny, zeros, both),
         Visual("arm/hand/1", mesh(3.0), Material((1, 0, 0, 1), texture=small), zeros[:1], both[:1]),
         Visual("nothing", replace(mesh(4.0), faces=np.zeros((0, 3), np.uint32)), shiny, zeros[:1], both[1:]),
@@ -90,6 +91,7 @@ def test_meshes_and_materials_are_read_back_for_each_body(
             if then.texture is None:
                 assert look.texture is None
                 continue
+            assert visual.mesh.uvs is not None and original.mesh.uvs is not None
             np.testing.assert_allclose(visual.mesh.uvs, original.mesh.uvs)
             assert look.texture is not None and look.texture.shape == then.texture.shape
             assert np.abs(look.texture.astype(int) - then.texture).mean() < 4
@@ -101,7 +103,9 @@ def test_rerun_shows_colours_textures_and_names_of_ids(episode: Made, tmp_path: 
     # Linear 0.1, 0.2 and 0.4 as sRGB; alpha is linear.
     factor = int(shiny["Mesh3D:albedo_factor"].values[0][0])
     assert list(factor.to_bytes(4, "big")) == [89, 124, 170, 128]
-    np.testing.assert_allclose(shiny["Mesh3D:vertex_normals"].values[0], mesh(2.0).normals)
+    normals = mesh(2.0).normals
+    assert normals is not None
+    np.testing.assert_allclose(shiny["Mesh3D:vertex_normals"].values[0], normals)
     assert "/world/cube/1" not in entities and "/world/arm/hand/1" in entities
     form = entities["/world/floor/0"]["Mesh3D:albedo_texture_format"].values[0][0]
     assert (form["width"], form["height"]) == (VIEWER_TEXELS, VIEWER_TEXELS // 2)
