@@ -34,5 +34,7 @@ def test_the_recorded_task_file_is_compared_with_its_neighbour_modules(tmp_path:
     assert changed_on_disk(info) == ""
     beside.write_text("WIDTH = 2\n")
     assert changed_on_disk(info) == "WIDTH of shapes.py"
+    beside.unlink()
+    assert changed_on_disk(info) == "WIDTH of shapes.py", "a module that is gone has changed too"
     file.unlink()
     assert changed_on_disk(info) == ""

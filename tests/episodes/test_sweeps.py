@@ -59,8 +59,8 @@ def test_each_point_is_summarised_by_its_own_episodes_only() -> None:
         (1, False, False, 1.0, {}),
         (2, None, None, 7.0, {}),
         (3, None, None, nan, {}),
-        (5, True, True, 6.0, {}),
-        (5, False, False, 6.0, {}),
+        (5, True, True, 12.0, {}),
+        (5, False, False, 0.0, {}),
     ]
     rows = [
         SweepEpisode(point, seed, once, last, None, 10, total, means)
@@ -166,6 +166,17 @@ def test_rows_of_unknown_points_and_invalid_numbers_are_left_out(tmp_path: Path)
 def test_a_file_that_is_no_sweep_is_refused(about: object, tmp_path: Path) -> None:
     with pytest.raises(NoSweep):
         clean_results(read_results(rewritten(tmp_path / "r.parquet", about)))
+
+
+def test_a_file_of_more_rows_than_a_sweep_can_have_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_results(tmp_path / "r.parquet", RESULTS)
+    monkeypatch.setattr("workbench.episodes.sweep_results.MAX_ROWS", 3)
+    assert len(read_results(tmp_path / "r.parquet").episodes) == 3
+    monkeypatch.setattr("workbench.episodes.sweep_results.MAX_ROWS", 2)
+    with pytest.raises(NoSweep):
+        read_results(tmp_path / "r.parquet")
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"PAR1" + bytes(1000) + b"PAR1"])
