@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,15 @@ from workbench.live.env_commands import (
     NextFailedEnv,
     NextFlaggedEnv,
     ShowEnvAtEvent,
+    ShowFirstFlagged,
     SortEnvs,
+    ToggleEnvEntries,
+    ToggleEnvEntry,
     TurnEnvs,
 )
-from workbench.live.events import EpisodeStepShown, SettingsChanged
+from workbench.live.events import EnvEventShown, EpisodeStepShown, SettingsChanged
 from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
-from workbench.live.panels.env_panel import ROWS_PER_PAGE, TABLE
+from workbench.live.panels.env_panel import FILTERS, ROWS_PER_PAGE, TABLE
 from workbench.page.command import Command
 from workbench.page.commands import TellUnfolded, ToggleTable
 
@@ -193,3 +197,88 @@ def test_a_press_on_an_env_that_no_longer_exists_is_refused(table: Table) -> Non
     table.live.session.rows = rows_of()
     table.live.part("Envs").ask(ShowEnvAtEvent(env=40))
     assert table.live.asked == [] and "no env 40" in table.live.client.notices[-1]
+
+
+@pytest.fixture
+def small(live_page: Live) -> Table:
+    """The table of six different envs, open."""
+    live_page.do(ToggleTable())
+    live_page.show(running(6, selected_env=4), rows_of())
+    return Table(live_page)
+
+
+def headings(table: Table) -> list[str]:
+    return [re.sub("<wbr>|\xa0", "", one) for one in re.findall(r"<th [^>]*>([^\n]*)</th>", table.html)]
+
+
+def test_the_table_marks_the_order_the_selected_env_and_counts_states(small: Table) -> None:
+    assert re.findall(r'wb-tally wb-num" title="\D*(\d+)"', small.html) == ["3", "1", "1", "1"]
+    assert re.findall(r'data-env="(\d)" class="wb-selected"', small.html) == ["4"]
+    assert headings(small)[:3] == ["env↑", "state", "steps"]
+    assert small.ask(SortEnvs(column="steps")) == [0, 4, 2, 5, 1, 3]
+    assert headings(small)[:3] == ["env", "state", "steps↑"]
+    assert small.ask(SortEnvs(column="steps")) == [3, 1, 5, 2, 0, 4]
+    assert headings(small)[2] == "steps↓"
+    assert small.ask(SortEnvs(column="steps")) == [0, 4, 2, 5, 1, 3]
+    assert small.choose("flagged") == [5] and small.live.part("Envs").typed("Show") == "flagged"
+    small.live.show(running(6), rows_of(outliers={}))
+    assert small.envs() == [] and FILTERS["flagged"][1] in small.html
+    small.live.show(running(6))
+    assert small.live.part("Envs").field("Show").off, "no task is loaded"
+
+
+def test_columns_of_entries_are_switched_on_and_off(small: Table) -> None:
+    def entries() -> dict[str, str]:
+        found = re.findall(r'aria-checked="(\w+)">(?:✓ )?([^<]*)<', small.html)
+        return {name: on for on, name in found}
+
+    assert entries() == {} and headings(small)[5:7] == ["success", "near"]
+    small.ask(ToggleEnvEntries())
+    assert entries() == {"success": "true", "near": "true"}
+    small.ask(SortEnvs(column="first near"))
+    assert small.envs() == [5, 0, 3, 1, 2, 4]
+    small.ask(ToggleEnvEntry(name="near"))
+    assert entries() == {"success": "true", "near": "false"} and "near" not in headings(small)
+    assert small.envs() == [*range(6)], "sorted by a column that is gone"
+    small.ask(ToggleEnvEntry(name="near"))
+    assert entries()["near"] == "true" and small.envs() == [5, 0, 3, 1, 2, 4]
+    small.ask(ToggleEnvEntries())
+    assert entries() == {}
+    never = np.full(6, -1, np.int32)
+    small.live.show(running(6, step_serial=2), rows_of(first={f"is_{k}": never for k in range(9)}))
+    assert headings(small)[5:-2] == [f"is_{k}" for k in range(6)]
+    small.ask(ToggleEnvEntries())
+    small.ask(ToggleEnvEntry(name="is_8"))
+    assert headings(small)[5:-2] == [*(f"is_{k}" for k in range(6)), "is_8"]
+
+
+def test_keys_go_to_the_event_that_there_is(small: Table) -> None:
+    def asked(command: Command, **changes: Any) -> list[Any]:
+        small.live.show(running(6, selected_env=4), rows_of(**changes))
+        small.live.asked.clear()
+        small.live.do(command)
+        return small.live.asked
+
+    ended = np.array([0, 1, 0, 3, 0, 0], np.int8)
+    before = rows_of().last
+    good = replace(before, outcome=np.ones(6, np.int8))
+    flagged = replace(good, outliers={3: (FELL,), 2: (FELL,)})
+    assert asked(NextFailedEnv()) == [EnvEventShown(2, "failed")]
+    assert asked(NextFailedEnv(), outcome=ended, last=good) == [EnvEventShown(3, "limit")]
+    assert asked(NextFlaggedEnv()) == [EnvEventShown(5, "flagged")] == asked(ShowFirstFlagged())
+    assert asked(ShowFirstFlagged(), outliers={}, last=flagged) == [EnvEventShown(2, "flagged")]
+    assert asked(NextFlaggedEnv(), outliers={}, last=flagged) == [EnvEventShown(2, "flagged")]
+    assert asked(ShowFirstFlagged(), outliers={}) == []
+    for command in (NextFlaggedEnv(), NextFailedEnv()):
+        refused = len(small.live.client.notices)
+        assert asked(command, outliers={}, outcome=ended * 0, last=good) == []
+        assert len(small.live.client.notices) == refused + 1
+
+
+def test_a_folded_table_is_that_of_a_new_task(small: Table) -> None:
+    small.live.do(ToggleTable())
+    before = small.html
+    small.live.show(running(6, step_serial=9), rows_of(steps=np.arange(6, dtype=np.int32)))
+    assert small.html == before
+    small.live.show(running(6, step_serial=9, task_serial=2), rows_of(steps=np.arange(6, dtype=np.int32)))
+    assert small.html != before, "its width is measured before it is opened"
