@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -20,6 +22,25 @@ from workbench.live.messages import Play
 from workbench.live.pause_when import PauseWhen, Test
 
 POSES = table_scene(3)[1]
+
+
+MET: dict[Test, Callable[[float, float], bool]] = {
+    "becomes true": lambda value, level: value != 0,
+    "becomes false": lambda value, level: value == 0,
+    "rises above": lambda value, level: value > level,
+    "falls below": lambda value, level: value < level,
+}
+
+
+@pytest.mark.parametrize("test", MET)
+def test_a_condition_is_about_one_number_of_one_env_or_joint(test: Test) -> None:
+    values = [0.0, 2.0, 3.0, np.nan]
+    step = step_of(table_scene(4)[1], height=np.array(values))
+    step = replace(step, qpos=np.array([[9.0, value] for value in values]), reward=np.array(values))
+    for entry in ("height", "reward", "slide"):
+        for env, value in enumerate(values):
+            met = PauseWhen(entry, test, 2.0).is_met(step, env, ("hinge", "slide"))
+            assert met == (MET[test](value, 2.0) and not np.isnan(value)), (entry, value)
 
 
 @given(st.sampled_from(get_args(Test)), st.floats(width=32), st.floats(width=32), st.floats(-9, 9, width=32))

@@ -17,7 +17,7 @@ from tests.drive.waiting import until
 from workbench.envs.camera_data import CameraKind, Picture
 from workbench.live.commands import PlayRun, ResetAll, Step
 from workbench.live.events import EnvEventShown, EpisodeStepShown, MomentShown, PagesCounted
-from workbench.live.history.moments import RESET, SUCCESS, WENT_BACK
+from workbench.live.history.moments import RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.live.messages import CameraRequest, DrawPast, PastPictures, Pictures, Placed, Restore
 from workbench.live.past import Strip
 from workbench.live.run import Run
@@ -226,7 +226,12 @@ def test_an_event_of_an_env_is_found_in_earlier_episodes_too(played: FakeWorkerS
     assert at(played) == lost
     session.happen(EnvEventShown(2, "failed"))
     assert (at(played), session.view().selected_env) == (lost, 2), "env 2 has not failed"
-    assert session.view().env_table is not None and session.view().env_table.failed.tolist() == [0, 1, 0]
+    played.step(fail=(1,))
+    played.reset((1,))
+    played.step(2)
+    session.happen(EnvEventShown(1, "failed"))
+    assert at(played) == played.view.timeline.last - 3, "the newest of two"
+    assert session.view().env_table is not None and session.view().env_table.failed.tolist() == [0, 2, 0]
 
 
 def test_an_end_at_the_time_limit_is_no_fail(fake: FakeWorkerSession) -> None:
@@ -253,6 +258,9 @@ def test_the_time_limit_does_not_end_a_driven_episode(fake: FakeWorkerSession, d
     table = fake.session.env_rows()
     assert (table.end[1], table.ended[1]) == ((-1, 0) if driven else (2, 1))
     assert (table.total[1] == table.total[0]) == driven, "the return goes on"
+    fake.session.change(selected_env=1)
+    found = dict(fake.session.look(lambda run: run.strip(0, 9)).events)
+    assert found == ({0: RESET} if driven else {0: RESET, 2: TRUNCATED, 3: TRUNCATED})
     fake.step(fail=(1,))
     assert fake.session.env_rows().failed.tolist() == [0, int(driven), 0]
 
@@ -379,6 +387,9 @@ def test_a_jump_is_undone_in_the_envs_that_are_still_in_it(played: FakeWorkerSes
     played.reset((0, 2))
     played.back((1,), (1,), 2)
     assert words() == ["reset at the end", "jump of env 1", "reset at the end"]
+    played.step(truncated=(0,))
+    played.reset((0, 2))
+    assert words()[0] == "reset of 2 envs", "one of them was reset by a person"
 
 
 def test_state_that_a_jump_could_not_restore_is_reported_only_for_its_env_and_episode(

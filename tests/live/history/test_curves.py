@@ -19,6 +19,7 @@ from workbench.live.history.curves import (
     Column,
     Columns,
     Group,
+    columns_by_label,
     columns_of,
     number_of,
     spans_of,
@@ -60,6 +61,9 @@ def test_a_long_line_becomes_few_points_and_keeps_each_peak_at_its_step(values: 
     drawn = np.isfinite(one)
     np.testing.assert_array_equal(values[0][x[drawn].astype(int) - 1], one[drawn])
     assert np.isnan(one).any() == (len(finite) < len(values[0]))
+    late, again = spans_of(values, first=41).points()
+    np.testing.assert_array_equal(late, x + 40)
+    np.testing.assert_array_equal(again[0], one)
 
 
 def everything() -> StepResult:
@@ -90,6 +94,14 @@ def test_entries_terms_and_joints_are_columns_named_after_them() -> None:
     ]
     assert columns[REWARD].tolist() == [2.0] * N and columns[SUCCESS].tolist() == [False, False, True]
     assert columns[REACH].tolist() == [1, 2, 0]
+
+
+def test_labels_are_unique_and_an_entry_of_eight_numbers_still_has_curves() -> None:
+    result = step(1, reach=[1, 2, 3])
+    entries = {"reach": np.zeros(N), "eight": np.zeros((N, 8)), "nine": np.zeros((N, 9))}
+    labels = columns_by_label(replace(result, evaluate={**result.evaluate, **entries}), JOINTS)
+    assert labels["reach"] == REACH and labels["evaluate reach"] == Column(Group.EVALUATE, "reach")
+    assert [one for one in labels if "[" in one] == [f"eight[{k}]" for k in range(8)]
 
 
 def test_one_number_equals_its_column() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.drive.session import FakeWorkerSession, fake_worker_session
+from tests.drive.session import FakeWorkerSession, fake_worker_session, moment
 from workbench.envs.outliers import OutlierKind
 from workbench.live.events import MomentShown
 from workbench.live.history.env_table import KEPT_REWARDS, Outcome
 from workbench.live.history.moments import FAIL, SUCCESS
+from workbench.task.description import Pulled
 
 N = 3
 
@@ -206,6 +207,32 @@ def test_a_numeric_success_counts_and_other_numbers_do_not(fake: FakeWorkerSessi
     rows = fake.session.env_rows()
     assert rows.first_true["success"].tolist() == [-1, 1, -1] and not {"distance", "each"} & {*rows.first}
     assert rows.outcome.tolist() == [Outcome.RUNNING, Outcome.SUCCESS, Outcome.RUNNING]
+
+
+def test_a_task_without_a_reward_has_no_returns(fake: FakeWorkerSession) -> None:
+    fake.load(reward_mode="none")
+    fake.reset()
+    for reset in (False, True):
+        if reset:
+            fake.reset((1,))
+        fake.step(reward=(1, 2, 3))
+        rows = fake.session.env_rows()
+        assert not rows.followed.any() and np.isnan(rows.rewards).all()
+
+
+def test_a_body_that_a_person_pulls_is_not_too_fast(fake: FakeWorkerSession) -> None:
+    def step(x: float, env: int, **more: Any) -> None:
+        event = moment(np.full(N, fake.view.timeline.last_tick + 1), number=fake.view.timeline.last, **more)
+        poses = event.step.poses.copy()
+        poses[env, 3, 0] += x
+        fake.tell(replace(event, step=replace(event.step, poses=poses)))
+
+    fake.play(0)
+    step(0.0, 1)
+    step(100.0, 1, pulled=Pulled(1, "cube", 3.0))
+    step(100.0, 2)
+    found = {env: [one.kind for one in seen] for env, seen in fake.session.env_rows().outliers.items()}
+    assert found == {2: [OutlierKind.FAST]}
 
 
 # --- outliers -------------------------------------------------------------------------------------------

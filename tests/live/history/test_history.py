@@ -10,12 +10,22 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.drive.session import FakeWorkerSession, fake_worker_session, moment, moments_of
+from tests.drive.session import FakeWorkerSession, fake_worker_session, moment, moment_at, moments_of
 from workbench.envs.camera_data import CameraKind, Picture
 from workbench.live.events import MomentShown
-from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.live.history.curves import REWARD, Column, Group
+from workbench.live.history.moments import (
+    BY_HAND,
+    FAIL,
+    RESET,
+    REWARD_NONFINITE,
+    SUCCESS,
+    TRUNCATED,
+    WENT_BACK,
+)
 from workbench.live.messages import CameraRequest, PastPictures, Pictures
 from workbench.live.timeline_commands import Seek
+from workbench.task.description import NO_MOMENT, Pulled
 
 EYE = CameraRequest("eye", "sensor")
 
@@ -213,3 +223,142 @@ def test_a_task_without_a_robot_has_steps_with_rewards(fake: FakeWorkerSession) 
         event = moment(np.full(3, number))
         fake.tell(replace(event, step=replace(event.step, action=None)))
     assert fake.view.timeline.last_tick == 2 and rewards(fake) == [[1, 2]] * 3
+
+
+# --- episodes, for curves --------------------------------------------------------------------------------
+
+
+def lived(fake: FakeWorkerSession) -> None:
+    """The reward of env k at tick t is 10 t + k, and so is its entry height but for the sign."""
+    fake.play(0)
+    step(fake, 2)  # moments 1 and 2
+    fake.reset((1,))  # 3
+    step(fake, 2)  # 4 and 5
+    fake.reset((1,))  # 6
+    fake.reset((1,))  # 7: an episode without a step
+    step(fake, 1)  # 8
+    fake.back((0,), (1,), 4)  # 9: env 0 goes on from the first step of env 1's second episode
+    step(fake, 1)  # 10
+
+
+def step(fake: FakeWorkerSession, count: int) -> None:
+    for _ in range(count):
+        reward = 10.0 * (fake.view.timeline.last_tick + 1) + np.arange(3, dtype=np.float32)
+        entries = {"success": np.zeros(3, bool), "height": -reward}
+        fake.step(reward=reward.tolist(), evaluate=entries)
+
+
+HEIGHT = Column(Group.EVALUATE, "height")
+
+
+def episodes(
+    fake: FakeWorkerSession, env: int, before: int, *columns: Column, last: int | None = None
+) -> list[tuple[list[int], ...]]:
+    """Steps of the shown episode and those before it, and the numbers of each column."""
+    newest = fake.view.timeline.last if last is None else last
+    found = fake.session.look(lambda run: run.episodes(env, newest, columns, before))
+    return [(one.steps.tolist(), *(one.values[each].tolist() for each in columns)) for one in found]
+
+
+def test_an_episode_has_the_steps_and_numbers_of_its_own_env_and_of_where_it_went_back_to(
+    fake: FakeWorkerSession,
+) -> None:
+    lived(fake)
+    assert episodes(fake, 2, 5, REWARD, HEIGHT) == [
+        ([1, 2, 3, 4, 5, 6], [12, 22, 32, 42, 52, 62], [-12, -22, -32, -42, -52, -62])
+    ]
+    own = [([1, 2], [51, 61]), ([1, 2], [31, 41]), ([1, 2], [11, 21])]
+    for count in (0, 1, 2, 9):  # an earlier question must not answer a later one
+        assert episodes(fake, 1, count, REWARD) == own[: count + 1]
+    assert episodes(fake, 1, 1, HEIGHT, REWARD)[1] == ([1, 2], [-31, -41], [31, 41])
+    assert episodes(fake, 0, 5, REWARD) == [([1, 2], [31, 60]), ([1, 2], [10, 20])]
+    assert episodes(fake, 1, 0, REWARD, last=8) == [([1], [51])], "the view is older than the history"
+    fake.session.happen(MomentShown(4))
+    assert episodes(fake, 1, 5, REWARD) == own[1:], "the whole shown episode, and those before it"
+    assert episodes(fake, 1, 0, REWARD, last=4) == [([1], [31])]
+
+
+def test_a_strip_can_show_any_number_of_the_selected_env(fake: FakeWorkerSession) -> None:
+    lived(fake)
+    for env in range(3):
+        fake.session.change(selected_env=env)
+        height = fake.session.look(lambda run: run.strip(2, 4, HEIGHT))
+        assert height.values.tolist() == [-20 - env, -30 - env, -40 - env]
+        assert fake.session.look(lambda run: run.strip(2, 4)).values.tolist() == [
+            20 + env,
+            30 + env,
+            40 + env,
+        ]
+
+
+# --- what a person does to bodies ------------------------------------------------------------------------
+
+
+def test_a_move_by_hand_is_an_event_without_a_reward_and_can_be_undone(fake: FakeWorkerSession) -> None:
+    fake.play(3)
+    fake.back((1,), (1,), 3, moved="cube")
+    assert events(fake, 1) == [(0, RESET), (3, BY_HAND)] and events(fake, 0) == [(0, RESET)]
+    np.testing.assert_array_equal(fake.view.step.reward, [3, np.nan, 3])
+    fake.session.change(selected_env=1)
+    assert fake.view.timeline.undo == "move of cube of env 1"
+    strip = fake.session.look(lambda run: run.strip(0, 3))
+    assert strip.branches == () and [branch for _, _, branch, _ in strip.segments] == [False, False]
+    assert by_hand(fake) == [False, True, False]
+
+
+def by_hand(fake: FakeWorkerSession) -> list[bool]:
+    rows = fake.session.env_rows().by_hand.tolist()
+    history = fake.session.look(lambda run: run.past.history)
+    newest = history.at(history.last)
+    assert [fake.session.look(lambda run, env=env: history.by_hand(newest, env)) for env in range(3)] == rows
+    return rows
+
+
+def test_a_pull_marks_its_first_step_and_its_env_until_the_next_episode(fake: FakeWorkerSession) -> None:
+    fake.play(1)
+    for body in ("cube", "cube", "peg"):
+        fake.step(pulled=Pulled(1, body, 3.0))
+    fake.step()
+    fake.step(pulled=Pulled(2, "peg", 3.0))
+    assert events(fake, 1) == [(0, RESET), (2, BY_HAND), (4, BY_HAND)]
+    assert events(fake, 2) == [(0, RESET), (6, BY_HAND)]
+    assert by_hand(fake) == [False, True, True]
+    fake.back((2,), (2,), 3)
+    assert by_hand(fake) == [False, True, False], "it went back to before the pull"
+    fake.back((2,), (1,), 5)
+    assert by_hand(fake) == [False, True, True], "it goes on from a state that a pull led to"
+    fake.reset((1,))
+    assert by_hand(fake) == [False, False, True]
+
+    def replay(env: int, serial: int, most: int = 99) -> int | None:
+        path = fake.session.look(lambda run: run.past.history.replay_path(env, serial, most))
+        return None if path is None else len(path.actions)
+
+    assert [replay(env, 2) for env in range(3)] == [2, None, 2], "only this env was pulled"
+    assert replay(0, 5, 5) == 5 and replay(0, 5, 4) is None, "too long"
+
+
+def test_envs_that_entered_a_recording_cannot_be_replayed_and_say_so(fake: FakeWorkerSession) -> None:
+    fake.play(2)
+    fake.back((1,), (1,), NO_MOMENT, recording="a.rrd, step 9", number=5)
+    fake.step()
+    fake.session.change(selected_env=1)
+    assert fake.view.timeline.undo == "going live of env 1" and fake.view.timeline.entered == 5
+    assert events(fake, 1) == [(0, RESET), (2, WENT_BACK)]
+    assert fake.session.look(lambda run: run.strip(0, 9)).branches == ()
+    last = fake.view.timeline.last
+    path = fake.session.look(lambda run: [run.past.history.replay_path(env, last, 99) for env in (0, 1)])
+    assert len(path[0].actions) == 3 and path[1] is None
+    fake.back((1,), (1,), 1)
+    assert fake.view.timeline.entered == 5, "the number of the last one that was entered"
+
+
+def test_pictures_of_a_camera_that_moved_are_drawn_again_at_each_moment(played: FakeWorkerSession) -> None:
+    human = replace(picture(0), kind="human")
+    for serial in (1, 2):
+        played.tell(PastPictures(serial, (picture(0), human)))
+    history = played.session.look(lambda run: run.past.history)
+    history.camera_moved("sensor", "eye")
+    assert [moment_at(played.session, at).outdated for at in (1, 2)] == [{(0, "sensor", "eye")}] * 2
+    played.tell(PastPictures(2, (picture(0),)))
+    assert [len(moment_at(played.session, at).outdated) for at in (1, 2)] == [1, 0]
