@@ -10,7 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.drive.waiting import TIMEOUT_SECONDS
-from workbench.actions.policy import PolicyFile, find_policy, list_policies
+from workbench.actions.policy import (
+    MAX_LISTED,
+    NoPolicy,
+    PolicyFile,
+    find_policy,
+    list_policies,
+    load_policy,
+)
 
 POLICIES = """
 raise RuntimeError("reading runs nothing")
@@ -49,6 +56,49 @@ def test_what_is_beside_the_task_is_listed_as_it_is_found(tmp_path: Path, monkey
         task / "same.py",
     ]
     assert list_policies(here, here) == ("same.py:act",)
+
+
+def test_a_file_is_found_here_before_it_is_found_beside_the_task(tmp_path: Path, monkeypatch) -> None:
+    here, task = tmp_path / "here", tmp_path / "task"
+    for folder in (here, task):
+        folder.mkdir()
+        (folder / "a.py").write_text(POLICIES)
+    (task / "b.py").write_text(POLICIES)
+    monkeypatch.chdir(here)
+    found = {"a.py:act": here / "a.py", "b.py:act": task / "b.py", f"{task}/a.py:act": task / "a.py"}
+    assert {one: find_policy(one, task) for one in found} == {one: (at, "act") for one, at in found.items()}
+    assert find_policy("lab.act:act", task) == ("lab.act", "act")
+    for missing in ("c.py:act", f"{here}/b.py:act", "a.py", ":act", "a.py:", " "):
+        with pytest.raises(NoPolicy):
+            find_policy(missing, task)
+    with pytest.raises(NoPolicy):
+        find_policy("b.py:act")
+
+
+def test_tests_are_not_listed_and_a_long_list_is_cut(tmp_path: Path) -> None:
+    for name in ("test_a", "conftest", "own"):
+        (tmp_path / f"{name}.py").write_text("def act(obs): ...\n")
+    assert list_policies(tmp_path, None) == ("own.py:act",)
+    (tmp_path / "own.py").write_text("".join(f"def act_{k}(obs): ...\n" for k in range(99)))
+    assert len(list_policies(tmp_path, None)) == MAX_LISTED
+    assert list_policies(tmp_path / "gone", None) == ()
+
+
+def test_a_policy_sees_the_modules_of_its_own_folder_and_its_last_save(
+    tmp_path: Path, clean_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, lab = tmp_path / "here", tmp_path / "lab"
+    for folder in (here, lab):
+        folder.mkdir()
+        (folder / "beside.py").write_text(f"WHERE = {folder.name!r}\n")
+    monkeypatch.chdir(here)
+    file = lab / "own_policy.py"
+    for number in (1, 2):  # the same size, within the same second
+        file.write_text(f"import beside\ndef act(obs): return beside.WHERE, {number}\n")
+        assert load_policy("own_policy.py:act", lab)(None) == ("lab", number)
+    for missing in ("own_policy.py:atc", "no_such_package.module:act", "beside:act"):
+        with pytest.raises(NoPolicy):
+            load_policy(missing, lab)
 
 
 @pytest.mark.parametrize("saved", ["here", "task"])

@@ -43,11 +43,23 @@ from workbench.live.events import (
     ReadingChosen,
     ReadingDue,
     Send,
+    SettingsChanged,
     VersionLoaded,
     WorkerDied,
 )
 from workbench.live.inspect_polling import READ_PERIOD_SECONDS
-from workbench.live.messages import Load, Loaded, Loading, ReloadReport, Settings, Status, TaskFailed
+from workbench.live.messages import (
+    CameraRequest,
+    Inspect,
+    Load,
+    Loaded,
+    Loading,
+    Placed,
+    ReloadReport,
+    Settings,
+    Status,
+    TaskFailed,
+)
 from workbench.live.process.supervisor import End
 from workbench.live.run import first_run
 from workbench.live.timeline_commands import ContinueFromHere, GoToLast, NextEvent, Seek, StepBack, UndoReset
@@ -215,3 +227,54 @@ def test_the_first_reading_is_immediate_and_the_next_is_delayed() -> None:
     state, _ = apply(state, stepped(1, ()), Now(100.05, 0.0))
     state, (soon,) = apply(state, Inspection(0, 0), Now(100.1, 0.0))
     assert isinstance(soon, Later) and soon.seconds == pytest.approx(READ_PERIOD_SECONDS - 0.1)
+
+
+def test_pictures_of_the_past_are_wanted_again_whenever_others_are_needed() -> None:
+    past = [loaded(None, "one"), stepped(0, (0, 1, 2)), stepped(1, ()), stepped(2, ()), MomentShown(1)]
+    events: list[Any] = [
+        SettingsChanged({"selected_env": 1}),
+        SettingsChanged({"cameras": (CameraRequest("base_camera", "sensor"),)}),
+        SettingsChanged({"pictures": "fast"}),
+        MomentShown(0),
+        Placed(("sensor", "base_camera"), None, camera()),
+    ]
+
+    def wanted(pages: int, event: Any) -> list[Any]:
+        state, effects = apply(state_after(*past, PagesCounted(pages)), event, Now(9.0, 9.0))
+        found = [one for one in effects if isinstance(one, Later)]
+        assert all(one.event == PastPicturesWanted(state.run.stands_at) for one in found)
+        return found
+
+    assert [len(wanted(1, event)) for event in events] == [1] * len(events)
+    assert [len(wanted(0, event)) for event in events] == [0] * len(events), "no page is open"
+    assert not wanted(1, Status(True, 20.0, 1.0)) and not wanted(1, MomentShown(1))
+    assert not wanted(1, MomentShown(None)), "live pictures come by themselves"
+
+
+def test_a_reading_is_repeated_after_a_failure_and_for_all_that_it_depends_on() -> None:
+    there = [loaded(None, "one"), PagesCounted(1), stepped(0, (0, 1, 2))]
+    asked = [*there, ReadingChosen(("joints",), "cube"), ReadingDue()]
+    state, effects = after(asked)
+    read = [one.request for one in effects if isinstance(one, Send) and isinstance(one.request, Inspect)]
+    assert read == [Inspect(0, ("joints",), "cube")] and state.run.reading == "asked"
+
+    def again(*events: Any) -> int:
+        new = after([*asked, *events])[1][len(effects) :]
+        return sum(isinstance(one, Later) and isinstance(one.event, ReadingDue) for one in new)
+
+    answer = Inspection(0, 0)
+    assert again(answer) == 0, "nothing has changed since"
+    for change in (
+        stepped(1, ()),
+        Asked(SelectEnv(env=1)),
+        ReadingChosen(("joints",), "table"),
+        ReadingChosen(("joints",)),
+        ReadingChosen((), "cube"),
+        ReadingChosen(("state",), "cube"),
+        loaded("patched", "two"),
+    ):
+        assert again(answer, change) == 1, change
+    assert again(TaskFailed(PROBLEM, kept=True, at_run=True), stepped(1, ())) == 1, "there is no answer"
+    assert again(stepped(1, ())) == 0, "the last answer is awaited"
+    assert again(answer, ReadingChosen(()), stepped(1, ())) == 0
+    assert again(answer, PagesCounted(0), stepped(1, ())) == 0
