@@ -16,6 +16,7 @@ import pytest
 
 from tests.drive.scenes import camera, problem
 from tests.drive.session import DEATH, FakeWorkerSession, fake_worker_session, moment
+from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.live.commands import (
@@ -301,6 +302,9 @@ def test_another_file_that_is_opened_takes_the_place_of_all_of_the_first(
     run = ready.session.look(lambda run: run)
     assert (run.own_file, run.own_folder, run.choices) == (file, folder, ())
     assert ready.session.knows_file(str(beside))
+    file.write_text("x = 1\n")
+    (load, *_) = until(lambda: ready.asked(Load), "the load of what was saved")
+    assert load.task == f"{file}:PickEnv"
 
 
 # --- events of the worker ------------------------------------------------------------------------------

@@ -73,3 +73,53 @@ def test_the_log_contains_no_control_character(pieces: list[bytes]) -> None:
         log.feed("stdout", b"\x1b]0;" + piece + b"\x9b\n" + piece)
     text = "".join((*log.view().texts, *(line.text for line in reported)))
     assert not [c for c in text if unicodedata.category(c) == "Cc" and c != "\t"]
+
+
+def test_a_style_lasts_over_lines_of_its_stream_until_the_stream_ends() -> None:
+    log, reported = a_log()
+    log.feed("stdout", b"\x1b[31mred\nstill\n")
+    log.feed("stderr", b"plain\n")
+    log.feed("stdout", b"\x1b[1mbold\x1b[0m plain\n\x1b[32m")
+    log.feed("stdout", b"")
+    log.feed("stdout", b"the next worker\n")
+    styles = [
+        [(run.text, run.style.color and run.style.color.number, run.style.bold) for run in line.runs]
+        for line in reported
+    ]
+    assert styles[:4] == [
+        [("red", 1, None)],
+        [("still", 1, None)],
+        [],
+        [("bold", 1, True), (" plain", None, None)],
+    ]
+    assert styles[-1] == [] and reported[-1].text == "the next worker"
+
+
+def test_a_cleared_log_is_empty_and_goes_on() -> None:
+    log, reported = a_log()
+    for number in range(3):
+        log.feed("stdout", b"line %d\n" % number)
+    assert log.tail(2) == "line 1\nline 2"
+    before = log.view()
+    log.clear()
+    assert log.view().lines == () and log.view().serial > before.serial
+    log.feed("stdout", b"after\n")
+    assert log.view().texts == ("after",) and len(reported) == 4 and before.texts[-1] == "line 2"
+
+
+def test_an_endless_line_is_cut() -> None:
+    log, reported = a_log()
+    for _ in range(10):
+        log.feed("stdout", b"x" * 1000)
+    log.feed("stdout", b"\nend\n")
+    assert reported[-1].text == "end" and len(reported) > 2
+    assert max(len(line.text) for line in reported) <= 2001
+
+
+def test_a_flood_is_forgotten_by_the_clear_that_follows() -> None:
+    log, _ = a_log()
+    log.feed("stdout", b"".join(b"line %d\n" % i for i in range(100_000)))
+    log.feed("stdout", b"".join(b"line %d\n" % i for i in range(100_000)))
+    assert log.view().dropped > 0
+    log.clear()
+    assert log.view().dropped == 0

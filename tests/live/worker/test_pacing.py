@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.live.worker.pacing import Pacer, Rate
+from workbench.live.worker.pacing import Pacer, Rate, Shares
 
 
 def steps_taken(pacer: Pacer, moments: list[float]) -> int:
@@ -59,3 +61,38 @@ def test_the_rate_is_that_of_the_last_second() -> None:
         rate.tick(i * 0.02)
     assert rate.per_second(1.98) == pytest.approx(50)
     assert rate.per_second(11.98) == pytest.approx(0.1), "the next step has taken ten seconds already"
+    rate.clear()
+    rate.tick(20.0)
+    assert rate.per_second(20.0) == 0.0, "one step has no rate"
+    rate.tick(22.0)
+    assert rate.per_second(22.0) == pytest.approx(0.5), "steps that take longer than the window have a rate"
+
+
+def test_unlimited_speed_is_always_due_and_never_waits() -> None:
+    pacer = Pacer(control_dt=0.05, speed=math.inf)
+    for now in (0.0, 0.0, 1.0):
+        assert pacer.due(now) and pacer.wait() == 0.0
+        pacer.spend()
+    pacer.speed = 1.0
+    pacer.start(2.0)
+    assert pacer.due(2.0), "the first step is due at once"
+    pacer.spend()
+    assert not pacer.due(2.0) and pacer.wait() == pytest.approx(0.05)
+
+
+def test_a_share_is_that_of_its_kind_of_work_in_the_last_seconds() -> None:
+    shares = Shares(window=2.0)
+    shares.add("recorded", 0.5, 10.5)
+    shares.add("watched", 0.2, 11.0)
+    shares.add("recorded", 0.1, 11.9)
+    assert shares.of("recorded", 12.0) == pytest.approx(0.3) and shares.of("watched", 12.0) == pytest.approx(
+        0.1
+    )
+    assert shares.of("recorded", 12.4) == pytest.approx(0.1), "a part of the first lies in the window"
+    assert shares.of("recorded", 13.0) == pytest.approx(0.05) and shares.of("other", 12.0) == 0.0
+    shares.clear(20.0)
+    assert shares.of("recorded", 20.5) == 0.0
+    shares.add("recorded", 0.25, 20.5)
+    assert shares.of("recorded", 20.5) == pytest.approx(0.5), "of the time since then"
+    shares.add("recorded", 9.0, 21.0)
+    assert shares.of("recorded", 21.0) == 1.0
