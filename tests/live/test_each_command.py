@@ -302,6 +302,8 @@ def test_another_file_that_is_opened_takes_the_place_of_all_of_the_first(
     run = ready.session.look(lambda run: run)
     assert (run.own_file, run.own_folder, run.choices) == (file, folder, ())
     assert ready.session.knows_file(str(beside))
+    (sent,) = does(ready, SetSpeed(speed=2.0))
+    assert isinstance(sent, Settings) and sent.policy_folder == str(folder)
     file.write_text("x = 1\n")
     (load, *_) = until(lambda: ready.asked(Load), "the load of what was saved")
     assert load.task == f"{file}:PickEnv"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.drive.env_rows import rows_of
 from tests.drive.live import Live
 from tests.drive.scenes import running, step_of
 from workbench.envs.step_result import StepResult
@@ -16,10 +18,11 @@ from workbench.live.commands import ToggleCurve
 from workbench.live.events import EpisodeStepShown
 from workbench.live.history.curves import Column, Group, columns_of
 from workbench.live.history.moments import EpisodeNumbers
-from workbench.live.panels.reward_panel import BESIDE_COLOUR, COLOURS
+from workbench.live.panels.reward_panel import BESIDE_COLOUR, COLOURS, MAX_CHARTS
 from workbench.live.past import TimelineView
 from workbench.live.timeline_commands import SeekOnCurve
 from workbench.live.view import SessionView
+from workbench.page.commands import TellOpenTab
 
 JOINTS = ("hinge", "slide")
 ONE = COLOURS[0]
@@ -174,3 +177,102 @@ def test_envs_whose_reward_is_nan_are_counted(live: Live) -> None:
     assert "NaN in 3 of 4 envs" in live.part("Reward").html("wb-warn")
     live.show(view)
     assert "NaN" not in live.part("Reward").html()
+
+
+def test_episodes_of_other_steps_are_drawn_at_their_own_steps(live_page: Live) -> None:
+    def read(env: int, last: int, columns: Sequence[Column], before: int) -> tuple[EpisodeNumbers, ...]:
+        def of(steps: np.ndarray) -> EpisodeNumbers:
+            return EpisodeNumbers(steps, dict.fromkeys(columns, 10.0 * steps + env), None)
+
+        return of(np.arange(5, 8)), *[of(np.arange(2, 5))] * min(before, 1)
+
+    episodes = Episodes(live_page, 7, 4)
+    live_page.session.answers["episodes"] = read
+    live_page.show(episodes.view(env=1))
+    chart = live_page.part("Reward").charts()[0]
+    np.testing.assert_allclose(chart.of(ONE), [[5, 51], [6, 61], [7, 71]], atol=0.1)
+    np.testing.assert_allclose(chart.of(BESIDE_COLOUR), [[2, 21], [3, 31], [4, 41]], atol=0.1)
+
+
+def test_the_others_are_at_most_ten_and_never_the_env_itself(live_page: Live) -> None:
+    episodes = Episodes(live_page, 3, 15, ended=5)
+    live_page.show(episodes.view(env=3))
+    live_page.part("Reward").set("Compare with", "the other envs")
+    live_page.again()
+    assert live_page.part("Reward").typed("Compare with") == "the other envs"
+    beside = live_page.part("Reward").charts()[0].of(BESIDE_COLOUR)
+    others = [env for env in range(11) if env != 3]
+    np.testing.assert_allclose(beside[::3, 1], [env + 15 for env in others], atol=0.1)
+    alone = Episodes(live_page, 3, 1, ended=2)
+    live_page.show(alone.view())
+    assert not live_page.part("Reward").shows("Compare with")
+    assert len(live_page.part("Reward").charts()[0].of(BESIDE_COLOUR)) == 2 * 3, "there is no other env"
+    episodes = Episodes(live_page, 3, 15, ended=5)
+    live_page.show(episodes.view(env=3))
+    live_page.part("Reward").set("Compare with", "its last ten episodes")
+    live_page.again()
+    assert len(live_page.part("Reward").charts()[0].of(BESIDE_COLOUR)) == 5 * 3
+
+
+def test_the_choice_shows_what_is_drawn_and_works_at_once_while_it_plays(live_page: Live) -> None:
+    view = Episodes(live_page, 3, 2, height=np.ones(2)).view()
+    live_page.do(TellOpenTab(tab="Reward"))
+    live_page.show(view)
+
+    def pressed() -> list[str]:
+        html = live_page.part("Reward").html("wb-curve-choice")
+        return re.findall(r'aria-pressed="true">([^<]*)<', html)
+
+    assert pressed() == ["reward", "success"]
+    for drawn in (["reward", "success", "height"], ["reward", "success"]):
+        live_page.part("Reward").ask(ToggleCurve(group="evaluate", name="height"))
+        live_page.again(0.01)
+        assert pressed() == drawn == [chart.title for chart in live_page.part("Reward").charts()]
+        assert any(f"{len(drawn)} of 5" in one for one in live_page.folders())
+
+
+def test_of_many_entries_only_some_get_a_chart(live_page: Live) -> None:
+    names = [f"e{k:02}" for k in range(MAX_CHARTS + 5)]
+    view = Episodes(live_page, 3, 2, **{name: np.ones(2) for name in names}).view()
+    live_page.show(view)
+    for name in names:
+        live_page.part("Reward").ask(ToggleCurve(group="evaluate", name=name))
+    live_page.again()
+    titles = [chart.title for chart in live_page.part("Reward").charts()]
+    assert titles == ["reward", "success", *names[:MAX_CHARTS]]
+
+
+@pytest.mark.parametrize(
+    ("mode", "advised"), [("dense", True), ("normalized_dense", True), ("sparse", False), ("none", False)]
+)
+def test_a_task_without_parts_or_without_a_reward(live_page: Live, mode: str, advised: bool) -> None:
+    view = Episodes(live_page, 3, 2).view()
+    assert view.task is not None
+    live_page.show(replace(view, task=replace(view.task, reward_mode=mode)))
+    titles = [chart.title for chart in live_page.part("Reward").charts()]
+    assert titles == (["success"] if mode == "none" else ["reward", "success"])
+    assert ("info[" in live_page.part("Reward").html()) is advised
+    terms: dict[str, Any] = {"reward_terms/reach": np.ones(2)}
+    live_page.show(Episodes(live_page, 3, 2, **terms).view())
+    assert "info[" not in live_page.part("Reward").html(), "it has parts"
+
+
+def test_a_reset_is_no_lost_reward(live_page: Live) -> None:
+    view = Episodes(live_page, 3, 2).view()
+    assert view.step is not None
+    reset = replace(view.step, reward=np.full(2, np.nan, np.float32), action=None)
+    live_page.show(replace(view, step=reset))
+    assert not live_page.part("Reward").html("wb-warn")
+    live_page.show(replace(view, step=replace(reset, action=np.zeros((2, 1), np.float32))))
+    assert live_page.part("Reward").html("wb-warn")
+
+
+def test_how_the_episodes_ended_is_counted_over_all_envs(live_page: Live) -> None:
+    def counts() -> list[str]:
+        return re.findall(r"</i> \D+(\d+)</span>", live_page.part("Reward").html("wb-outcomes"))
+
+    live_page.show(running(6), rows_of())
+    assert counts() == ["4", "4", "2"]
+    none = np.zeros(6, int)
+    live_page.show(running(6), rows_of(ended=none, succeeded=none, failed=none))
+    assert counts() == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -42,7 +43,7 @@ class Form:
     """The form on a session that reports the values set here."""
 
     def __init__(self, panels: Panels, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.panels, self.applied = panels, list[TaskOptions]()
+        self.panels, self.session, self.applied = panels, session, list[TaskOptions]()
         view = running(4)
         assert view.task is not None
         task = replace(view.task, made=MADE, device="cpu, pictures on llvmpipe")
@@ -200,6 +201,66 @@ def test_accepted_options_are_shown_as_in_effect(form: Form) -> None:
     assert "--env size=0.5" in form.panels.html("wb-env-options")
     form.panels.ask(ResetEnvOptions())
     assert form.applied[-1] == TaskOptions(4)
+
+
+def test_a_new_robot_has_its_own_control_mode(form: Form) -> None:
+    form.view = replace(
+        form.view, options=TaskOptions(4, env_kwargs={"control_mode": "pd_joint_pos", "x": 1})
+    )
+    form.draw()
+    form.set("Robot", "fetch")
+    form.press("Apply")
+    assert form.applied[-1].env_kwargs == {"robot_uids": "fetch", "x": 1}
+    form.set("Control", "pd_ee_pose")
+    form.press("Apply")
+    assert form.applied[-1].env_kwargs == {"robot_uids": "fetch", "control_mode": "pd_ee_pose", "x": 1}
+    form.press("Discard")
+    form.set("Control", "pd_ee_pose")
+    form.press("Apply")
+    assert form.applied[-1].env_kwargs == {"control_mode": "pd_ee_pose", "x": 1}
+
+
+def test_the_form_is_that_of_the_tasks_own_keywords_and_can_be_discarded(form: Form) -> None:
+    form.set("Envs", 8)
+    form.press("Discard")
+    assert form.panels.field("Envs").value == 4
+    assert form.view.task is not None
+    again = Keyword("way", "choice", "1", "1", ("1", '"1"'))
+    made = replace(MADE, own=(again, Keyword("late", "int", "5", "5")))
+    form.view = replace(form.view, task=replace(form.view.task, made=made))
+    form.draw()
+    labels = [field.label for field in form.panels.fields()]
+    assert "size" not in labels and form.panels.field("late").value == 5
+    assert list(form.panels.field("way").options) == ["1", '"1"'], (
+        "labels in JSON, since they are equal otherwise"
+    )
+    form.set("late", 6)
+    form.press("Apply")
+    assert form.applied == [TaskOptions(4, env_kwargs={"late": 6})]
+    form.view = replace(form.view, state="stopped")
+    form.draw()
+    assert form.panels.button("Apply").command is None, "no worker could build them"
+
+
+def test_the_command_has_what_the_form_lacks(form: Form, monkeypatch: pytest.MonkeyPatch) -> None:
+    def told(**changes: Any) -> str:
+        form.view = replace(form.view, **changes)
+        form.draw()
+        return " ".join(re.sub("<[^>]*>", " ", form.panels.html("wb-env-options")).split())
+
+    assert "--seed 5" in told(seed=5) and "cpu, pictures on llvmpipe" in told()
+    machine = TaskOptions(4, env_kwargs={"render_backend": "none"})
+    assert "render_backend" in told(options=machine) and not form.panels.presses(ResetEnvOptions())
+    both = replace(machine, env_kwargs={"render_backend": "none", "size": 0.5, "hidden": 1})
+    assert "Also given: render_backend = &#34;none&#34;, hidden = 1" in told(options=both)
+    form.panels.ask(ResetEnvOptions())
+    assert form.applied[-1] == machine, "it is about this computer, not about the task"
+    refused = TaskOptions(400, env_kwargs={"render_backend": "none", "hidden": 1})
+    assert "num_envs = 400, no size." in told(options_refused=refused)
+    assert form.panels.shows("Discard", "button")
+    session = type(form.session)
+    monkeypatch.setattr(session, "present_reference", property(lambda self: "other.py:Two"))
+    assert "other.py:Two" in told()
 
 
 VALUES = st.booleans() | st.integers(-5, 5) | st.floats(-5, 5) | st.text(max_size=3) | st.none()

@@ -12,7 +12,7 @@ from tests.drive.entries import ENTRIES
 from tests.drive.scenes import step_of, table_scene
 from workbench.envs.evaluate_entries import split_entries
 from workbench.envs.step_result import OtherEntry
-from workbench.live.panels.reward_panel import NumberRow, number_rows
+from workbench.live.panels.reward_panel import MAX_ROWS, NumberRow, number_rows
 from workbench.page.widgets.templates import render
 
 _, POSES = table_scene(4)
@@ -27,6 +27,40 @@ def test_bools_are_counted_and_numbers_averaged() -> None:
     assert (rows["success"].selected, rows["success"].batch) == ("yes", "3 of 4")
     assert (rows["distance"].selected, rows["distance"].batch) == ("1.000", "mean 1.500")
     assert rows["elapsed steps"].selected == "7 / 50"
+
+
+def test_right_after_a_reset_there_is_no_reward_but_a_rescored_one_is_shown() -> None:
+    def shown(env: int, action: bool, reward: list[float]) -> list[tuple[str, str]]:
+        step = replace(
+            step_of(POSES, **{"reward_terms/reach": np.array(reward, float)}),
+            reward=np.array(reward, np.float32),
+            elapsed_steps=np.array([0, 3, 4, 5]),
+            action=np.zeros((4, 1), np.float32) if action else None,
+        )
+        rows = {row.name: row for row in number_rows(step, env, None)}
+        return [(rows[name].selected, rows[name].batch) for name in ("reward", "reward_terms/reach")]
+
+    nan = np.nan
+    assert shown(0, True, [0, 1, 2, 3]) == [("—", "mean 2.000")] * 2
+    assert shown(1, True, [0, 1, 2, nan]) == [("1.000", "mean 1.500, NaN in 1 of 3")] * 2
+    assert shown(3, True, [0, 1, 2, nan]) == [("NaN", "mean 1.500, NaN in 1 of 3")] * 2
+    assert shown(3, False, [0, 1, 2, nan]) == [("—", "mean 1.500")] * 2, "it was restored"
+    assert shown(2, False, [nan] * 4) == [("—", "—")] * 2
+
+
+def test_rows_are_of_the_selected_env_and_few() -> None:
+    entries: dict[str, Any] = {"success": [True, False, False, False], "fail": [False, True, False, False]}
+    assert [rows_of(env, **entries)["success"].mood for env in range(2)] == ["good", ""]
+    assert [rows_of(env, **entries)["fail"].mood for env in range(2)] == ["", "bad"]
+    rows = rows_of(2, far=np.array([0, 0, 12345.0, 0]), at=np.arange(24.0).reshape(4, 6), count=[1, 2, 3, 6])
+    assert [rows[name].selected for name in ("far", "at", "count")] == [
+        *("1.23e+04", "[12.000, 13.000, 14.000, 15.000, … 6]", "3")
+    ]
+    assert rows["count"].batch == "mean 3.0" and list(rows)[:2] == ["elapsed steps", "reward"]
+    many = number_rows(
+        step_of(POSES, success=[True] * 4, **{f"e{k:03}": [0.0] * 4 for k in range(300)}), 0, None, "none"
+    )
+    assert len(many) == MAX_ROWS + 2 and many[1].name == "success" and "101" in many[-1].name
 
 
 def test_nan_is_shown() -> None:
