@@ -226,7 +226,7 @@ def test_the_choice_shows_what_is_drawn_and_works_at_once_while_it_plays(live_pa
     assert pressed() == ["reward", "success"]
     for drawn in (["reward", "success", "height"], ["reward", "success"]):
         live_page.part("Reward").ask(ToggleCurve(group="evaluate", name="height"))
-        live_page.again(0.01)
+        live_page.again(0.1)
         assert pressed() == drawn == [chart.title for chart in live_page.part("Reward").charts()]
         assert any(f"{len(drawn)} of 5" in one for one in live_page.folders())
 

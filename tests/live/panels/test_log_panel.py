@@ -28,6 +28,7 @@ from workbench.live.process.captured_output import (
     PrintedLog,
     StyledText,
 )
+from workbench.live.process.supervisor import ProcessMemory
 
 LINES = (
     PrintedLine("stdout", "reward 0.5"),
@@ -45,6 +46,48 @@ def test_the_filter_matches_text_in_any_case_or_a_stream() -> None:
     assert kept("stderr:") == ["a Warning"]
     assert kept("stdout: done") == ["done"]
     assert kept("nothing like it") == []
+
+
+def test_a_filter_is_of_one_stream_and_a_text_and_counts_its_lines() -> None:
+    lines = (*LINES, PrintedLine("stderr", "done too"), PrintedLine("stdout", "a stderr: line"))
+    counts = {"": "5 of 5", "done": "2 of 5", "stderr: done": "1 of 5", "a stderr": "1 of 5", "stdin:": ""}
+    for wanted, count in counts.items():
+        assert re.findall(r"\d+ of \d+", log_html(Printed(1, lines, 0), wanted)) == ([count] if count else [])
+
+
+def test_of_too_many_colours_the_newest_lines_have_theirs() -> None:
+    red = StyledText("x", Style(color=Color.from_ansi(1)))
+    lines = [(str(at), (red,) * 500) for at in range(5)]
+    spans = spans_of_lines(lines)
+    assert [[one.text for one in line] for line in spans] == [["0"], ["1"], *[["x"] * 500] * 3]
+
+
+def test_a_log_that_only_dropped_lines_has_controls_and_memory_is_shown(live_page: Live) -> None:
+    log = live_page.part("Log")
+    live_page.show(running(2, printed=Printed(1, (), 12), vitals=ProcessMemory(3 * 2**30, 8 * 2**30, 2**29)))
+    assert log.shows("Clear") and log.shows("Filter") and "12" in log.html()
+    assert re.findall(r"[\d.]+ [MG]B", log.html("Memory")) == ["3.0 GB", "8.0 GB", "512 MB"]
+    live_page.show(running(2, printed=Printed(1, (), 12), vitals=ProcessMemory(2**29)))
+    assert re.findall(r"[\d.]+ [MG]B", log.html("Memory")) == ["512 MB"]
+
+
+def test_a_paused_log_shows_its_switch_and_follows_again(live_page: Live) -> None:
+    log = live_page.part("Log")
+    live_page.show(running(2, printed=Printed(1, LINES[:1], 0)))
+    log.set("Pause", True)
+    live_page.again()
+    assert log.typed("Pause") is True
+    for serial, shown in ((2, False), (3, False)):
+        live_page.show(running(2, printed=Printed(serial, LINES, 0)))
+        assert ("Warning" in log.html()) == shown
+    log.press("Clear")
+    live_page.show(running(2, printed=Printed(4, LINES, 0)))
+    assert "Warning" in log.html(), "a cleared log is drawn"
+    live_page.show(running(2, printed=Printed(5, LINES[:1], 0)))
+    assert "Warning" in log.html(), "and paused again"
+    log.set("Pause", False)
+    live_page.again()
+    assert "Warning" not in log.html() and log.typed("Pause") is False
 
 
 def test_a_flood_is_shown_as_its_last_lines_and_a_count() -> None:

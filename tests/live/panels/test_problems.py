@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.drive.live import Live
@@ -167,6 +169,62 @@ def test_long_work_can_be_stopped_and_is_shown_instead_of_a_problem(live: Live) 
     assert not busy.seen and "KeyError" in banner(live)
 
 
+@pytest.mark.parametrize(
+    ("busy", "shown", "interrupt"),
+    [
+        (LOOP, True, True),
+        (replace(LOOP, held=True), False, False),
+        (replace(LOOP, drawing=True), True, False),
+        (replace(LOOP, getting_ready=True), False, False),
+    ],
+)
+def test_what_a_debugger_or_the_renderer_holds_up_is_not_interrupted(
+    live: Live, busy: Busy, shown: bool, interrupt: bool
+) -> None:
+    live.show(running(2, busy=busy))
+    assert live.part("Busy").seen == shown
+    assert not shown or (live.part("Busy").shows(INTERRUPT), live.part("Busy").shows(RESTART)) == (
+        interrupt,
+        True,
+    )
+    live.show(running(2))
+    assert not live.part("Busy").seen
+
+
+def test_without_a_worker_the_banner_offers_one_and_nothing_that_needs_it(live: Live) -> None:
+    def offered(view: SessionView) -> tuple[bool, bool]:
+        live.show(view)
+        return live.part("Problem").shows(NEW_WORKER), live.part("Problem").shows(REBUILD)
+
+    assert offered(failed("evaluate", 1)) == (False, True)
+    assert offered(failed("evaluate", 2, state="stopped")) == (True, False)
+    assert offered(failed("evaluate", 3, task=None)) == (False, False), "there is no scene"
+    assert offered(failed("worker", 4)) == (True, False)
+    assert offered(failed("worker", 5, state="paused")) == (False, False), "another worker runs"
+
+
+def test_the_banner_names_the_file_until_a_task_runs_and_says_what_is_left(live: Live) -> None:
+    def told(view: SessionView) -> tuple[str, str]:
+        live.show(view)
+        title, kept, *_ = live.part("Problem").htmls()
+        return re.findall(r"<b>([^<]*)</b>", title.content)[0], kept.content
+
+    task = told(failed("evaluate", 1))[0]
+    assert task == "PushEnv" and told(failed("policy", 2))[0] not in (task, "The file")
+    file = told(failed("evaluate", 3, task=None))
+    assert file[0] == told(failed("syntax", 4))[0] == "The file"
+    nothing = told(failed("import", 5, task=None, problem=replace(problem(), file=None, line=None)))
+    assert nothing[1] != file[1] and nothing[0] != "PushEnv"
+    stopped = told(failed("evaluate", 6, state="stopped"))[1]
+    assert stopped == told(failed("worker", 7))[1] != told(failed("worker", 8, state="paused"))[1]
+    assert told(failed("evaluate", 9, state="running"))[1] != told(failed("evaluate", 10, playing=False))[1]
+    steps = failed("step", 11, state="paused", playing=False, problem_at_run=True)
+    assert steps.step is not None
+    for number in (7, 9):
+        step = replace(steps.step, elapsed_steps=np.full(2, number, np.int32))
+        assert f"step {number} " in told(replace(steps, step=step))[1], "the text below is not that of before"
+
+
 def test_a_long_load_is_shown_with_its_phase(live: Live) -> None:
     phase = "reading <meshes>"
     for busy, shown in ((Busy(42.0, "loading"), True), (LOOP, False)):
@@ -285,6 +343,11 @@ def test_a_load_is_shown_with_level_time_reason_and_what_was_not_carried_over(li
         and f"actor cube_{MAX_NAMED}" not in status_text
     )
     assert "and 3 more" in status_text and "<script" not in status_text
+    times = {999.4: "999 ms", 1000.0: "1.0 s", 12345.0: "12.3 s"}
+    for milliseconds, text in times.items():
+        assert text in version(live, running(2, reload=report, load_milliseconds=milliseconds))
+    kept, cleared = (version(live, running(2, reload=report, timeline_cleared=one)) for one in (False, True))
+    assert kept != cleared
 
 
 def test_while_the_file_is_broken_the_broken_save_comes_first(live: Live) -> None:

@@ -18,6 +18,7 @@ from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
 from workbench.live.env_commands import ShowEnvs, ToggleOnlySelected
 from workbench.live.panels.view_panel import ViewIcons, ViewPanel
+from workbench.page.command import Command
 from workbench.page.commands import ShowCollisions, ShowFrames, ShowFrustums, ToggleTheme
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
@@ -274,3 +275,31 @@ def test_the_selected_env_or_all_envs_are_shown_as_chosen_for_the_task(panels: P
     assert "Collision shapes" in panels.html("wb-view-icons")
     panels.ask(ShowCollisions(on=True))
     assert choice.collisions
+    view = replace(bare, task=replace(bare.task, geometry=geometry))
+    states: dict[str, Command] = {
+        "Cameras": ShowFrustums(on=True),
+        "Frames": ShowFrames(on=True),
+        "Collision shapes": ShowCollisions(on=True),
+    }
+    for _ in range(2):  # each is switched on, off and on again
+        for name, on in states.items():
+            icons.draw(view)
+            before = panels.button(name)
+            assert before.command is not None and (before.command == on) != before.pressed
+            panels.do(before.command)
+            icons.draw(view)
+            assert panels.button(name).pressed != before.pressed
+            others = [panels.button(one).pressed for one in states if one != name]
+            panels.do(panels.button(name).command or on)
+            icons.draw(view)
+            assert [panels.button(one).pressed for one in states if one != name] == others
+    for all_envs in (True, False):
+        panels.ask(ShowEnvs(all_envs=all_envs))
+        icons.draw(replace(view, settings=replace(view.settings, selected_env=3)))
+        on = {one.text.strip(): one.pressed for one in panels.buttons()}
+        assert (on["All envs"], on["The selected env"]) == (all_envs, not all_envs)
+        assert "env 3" in panels.html("wb-view-icons")
+    for _ in range(2):
+        before_toggle = icons.only_selected
+        panels.do(ToggleOnlySelected())
+        assert icons.only_selected != before_toggle

@@ -54,6 +54,7 @@ class VersionPanel(PagePart[SessionView]):
             notices,
             view.refused,
             view.loads,
+            view.timeline_cleared,
         )
 
     def draw(self, view: SessionView) -> None:
