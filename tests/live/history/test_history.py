@@ -291,6 +291,15 @@ def test_a_strip_can_show_any_number_of_the_selected_env(fake: FakeWorkerSession
         ]
 
 
+def test_a_moment_keeps_what_a_recording_needs_of_it(played: FakeWorkerSession) -> None:
+    played.reset(seeds=np.array([4, 5, 6]))
+    played.step(acted_by="policy a.py:act")
+    reset, stepped = moments_of(played.session)[-2:]
+    assert reset.seeds is not None and reset.seeds.tolist() == [4, 5, 6] and stepped.seeds is None
+    assert (reset.acted_by, stepped.acted_by) == ("", "policy a.py:act")
+    assert reset.number + 1 == stepped.number and reset.as_recorded is reset.step
+
+
 # --- what a person does to bodies ------------------------------------------------------------------------
 
 

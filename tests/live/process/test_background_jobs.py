@@ -51,6 +51,11 @@ def seen() -> Iterator[Seen]:
     stop_listening(seen.said.append)
 
 
+def test_progress_counts_only_if_there_is_something_to_count() -> None:
+    texts = [JobProgress("drawing", done, total).text for done, total in ((0, 0), (0, 1), (1, 2))]
+    assert texts == ["drawing", "drawing", "drawing, 1 of 2"]
+
+
 def test_a_failed_job_is_reported_and_the_next_one_runs(seen: Seen) -> None:
     async def broken(job: Job) -> None:
         raise AttributeError("no such thing")

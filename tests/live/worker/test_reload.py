@@ -118,6 +118,45 @@ def test_an_edited_reset_is_tried_without_changing_the_moment_and_used_at_the_ne
     assert torch.allclose(cube[:, :2], torch.zeros(2), atol=1e-6)
 
 
+def test_a_patched_version_is_described_as_a_fresh_one_and_has_its_time_limit(desk: Desk) -> None:
+    env = desk.task.env
+    report = desk.save(desk.good.replace("return reward\n", "return reward + 3\n"))
+    assert report.level == "patched" and desk.task.env is env
+    fresh = open_task(str(desk.file), desk.options)
+    try:
+        mine, theirs = desk.running.opened.description, fresh.description
+        for name in (
+            *(
+                "source_files",
+                "source_hash",
+                "source",
+                "max_episode_steps",
+                "chosen",
+                "others",
+                "in_place_of",
+            ),
+            *("notices", "outlier_rules", "env_id", "class_name", "actions", "reward_mode", "obs_mode"),
+        ):
+            assert getattr(mine, name) == getattr(theirs, name), name
+        limit = mine.max_episode_steps
+        assert limit is not None
+    finally:
+        fresh.env.close()
+    desk.task.reset(0)
+    desk.task.env._elapsed_steps += limit - 3
+    assert [desk.step().truncated.tolist() for _ in range(3)] == [[False] * 3, [False] * 3, [True] * 3]
+
+
+@pytest.mark.parametrize("level", ["patched", "rebuilt"])
+def test_a_requested_level_is_taken_whatever_has_changed(desk: Desk, level: LoadLevel) -> None:
+    before, env = desk.step(2), desk.task.env
+    report = desk.edit("base_color=[0.05,", "base_color=[0.4,", level)
+    assert report.level == level and (desk.task.env is env) == (level == "patched")
+    np.testing.assert_allclose(desk.running.last.poses, before.poses, atol=1e-4)
+    np.testing.assert_array_equal(desk.running.last.elapsed_steps, before.elapsed_steps)
+    assert desk.save(desk.file.read_text()).level == "same"
+
+
 # --- failures --------------------------------------------------------------------------------------
 
 
