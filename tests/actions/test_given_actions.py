@@ -41,6 +41,21 @@ def test_an_episode_of_each_array_begins_where_the_env_likes(tmp_path: Path) -> 
     assert [(run.seed, dict(run.env_states)) for run in runs] == 2 * [(-1, {})]
 
 
+@pytest.mark.parametrize(
+    "array",
+    [np.zeros((0, 3)), np.zeros(3), np.zeros((2, 4, 3, 1)), np.array([["a"]]), np.zeros((2, 3), complex)],
+)
+def test_what_is_no_list_of_actions_is_refused(tmp_path: Path, array: np.ndarray) -> None:
+    np.save(tmp_path / "a.npy", array)
+    np.savez(tmp_path / "b.npz", array)
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(ValueError, match=name):
+            read_actions(tmp_path / name)
+    np.savez(tmp_path / "c.npz", np.zeros((2, 4, 3)))
+    with pytest.raises(ValueError, match="c.npz"):
+        read_actions(tmp_path / "c.npz")
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_no_robot_can_do_is_refused(tmp_path: Path, value: float) -> None:
     np.save(tmp_path / "a.npy", np.array([[0.0, value]]))

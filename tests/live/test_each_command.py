@@ -100,7 +100,7 @@ def ready(fake: FakeWorkerSession) -> FakeWorkerSession:
     return fake
 
 
-def does(fake: FakeWorkerSession, what: Command | object) -> list[object]:
+def does(fake: FakeWorkerSession, what: Any) -> list[object]:
     """What this command or event asks of the worker."""
     fake.asked(object)
     if isinstance(what, Command):
@@ -498,6 +498,24 @@ def test_a_load_is_listed_with_its_whole_time_and_the_options_that_it_used(playe
     played.session.happen(OptionsApplied(TaskOptions(3, env_kwargs={"size": 2})))
     (load,) = played.asked(Load)[-1:]
     assert load.options.env_kwargs == {"size": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "moments", "rescored"),
+    [
+        ({}, 4, 0),
+        ({"same_scene": True, "source_hash": "b"}, 4, 1),
+        ({"source_hash": "b"}, 0, 0),
+        ({"same_scene": True, "chosen": "Other"}, 0, 0),
+        ({"same_scene": True, "num_envs": 2}, 0, 0),
+    ],
+)
+def test_a_new_process_keeps_the_past_of_the_same_scene_and_rescores_it_with_other_code(
+    played: FakeWorkerSession, changes: dict[str, Any], moments: int, rescored: int
+) -> None:
+    played.load("restarted", **changes)
+    assert (played.view.timeline.moments, len(played.rescored)) == (moments, rescored)
+    assert played.view.timeline_cleared == (moments == 0)
 
 
 def test_a_worker_that_dies_while_it_draws_takes_the_watched_cameras_along(played: FakeWorkerSession) -> None:

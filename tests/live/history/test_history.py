@@ -318,7 +318,7 @@ def test_a_move_by_hand_is_an_event_without_a_reward_and_can_be_undone(fake: Fak
 def by_hand(fake: FakeWorkerSession) -> list[bool]:
     rows = fake.session.env_rows().by_hand.tolist()
     history = fake.session.look(lambda run: run.past.history)
-    newest = history.at(history.last)
+    (newest,) = moments_of(fake.session)[-1:]
     assert [fake.session.look(lambda run, env=env: history.by_hand(newest, env)) for env in range(3)] == rows
     return rows
 

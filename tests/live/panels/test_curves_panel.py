@@ -182,7 +182,9 @@ def test_envs_whose_reward_is_nan_are_counted(live: Live) -> None:
 def test_episodes_of_other_steps_are_drawn_at_their_own_steps(live_page: Live) -> None:
     def read(env: int, last: int, columns: Sequence[Column], before: int) -> tuple[EpisodeNumbers, ...]:
         def of(steps: np.ndarray) -> EpisodeNumbers:
-            return EpisodeNumbers(steps, dict.fromkeys(columns, 10.0 * steps + env), None)
+            return EpisodeNumbers(
+                steps, dict.fromkeys(columns, (10.0 * steps + env).astype(np.float32)), None
+            )
 
         return of(np.arange(5, 8)), *[of(np.arange(2, 5))] * min(before, 1)
 
@@ -233,7 +235,8 @@ def test_the_choice_shows_what_is_drawn_and_works_at_once_while_it_plays(live_pa
 
 def test_of_many_entries_only_some_get_a_chart(live_page: Live) -> None:
     names = [f"e{k:02}" for k in range(MAX_CHARTS + 5)]
-    view = Episodes(live_page, 3, 2, **{name: np.ones(2) for name in names}).view()
+    entries: dict[str, Any] = {name: np.ones(2) for name in names}
+    view = Episodes(live_page, 3, 2, **entries).view()
     live_page.show(view)
     for name in names:
         live_page.part("Reward").ask(ToggleCurve(group="evaluate", name=name))

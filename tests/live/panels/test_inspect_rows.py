@@ -199,6 +199,7 @@ def test_the_selected_body_is_shown_first_with_its_pose_and_its_contacts(live_pa
     assert "wb-body" not in inspect.html()
 
 
+ORIGIN = np.zeros(3, np.float32)
 PHYSICS = BodyReadings(
     "cube",
     mass=0.5,
@@ -209,14 +210,12 @@ PHYSICS = BodyReadings(
     has_gravity=False,
     shapes=("box", "convex mesh", "box"),
     materials=((0.1, 0.2, 0.3),),
-    joint=LinkJoint("hinge", "revolute_unwrapped", -np.inf, np.inf, np.zeros(3), np.zeros(3)),
+    joint=LinkJoint("hinge", "revolute_unwrapped", -np.inf, np.inf, ORIGIN, ORIGIN),
 )
 
 
 def test_the_selected_body_has_its_own_physics_contacts_and_pose(live_page: Live) -> None:
-    pair = Touching(
-        ("arm/hand", "cube"), PRESSED.force, PRESSED.impulse, *[np.zeros((1, 3), np.float32)] * 2, 0
-    )
+    pair = replace(PRESSED, bodies=("arm/hand", "cube"))
     other = replace(pair, bodies=("ground", "table"))
     reading = Inspection(1, 5, contacts=(pair, other), body=PHYSICS)
     view = running(2, selected_env=1, inspection=reading)
@@ -247,9 +246,7 @@ def test_the_selected_body_has_its_own_physics_contacts_and_pose(live_page: Live
     }
     assert shown(view) == facts and touched() == ["arm/hand"] and pose() == "0.010, 0.000, 0.020"
     assert inspect.presses(SelectBody(body="arm/hand"))
-    slide = replace(
-        PHYSICS, has_gravity=True, joint=LinkJoint("rail", "prismatic", 0.0, 2.0, *[np.zeros(3)] * 2)
-    )
+    slide = replace(PHYSICS, has_gravity=True, joint=LinkJoint("rail", "prismatic", 0.0, 2.0, ORIGIN, ORIGIN))
     later = shown(replace(view, inspection=replace(reading, body=slide), step_serial=2))
     assert (later["mass"], later["joint"]) == ("0.5 kg", "rail, prismatic, 0.000 to 2.000 m")
     assert view.step is not None

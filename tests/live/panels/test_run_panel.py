@@ -73,7 +73,7 @@ def test_the_sliders_show_and_move_the_chosen_envs(live_page: Live) -> None:
 
 
 def test_a_condition_is_shown_with_what_it_needs(live_page: Live) -> None:
-    def shown(*when: Any) -> tuple[str, object, object]:
+    def shown(*when: Any) -> tuple[object, ...]:
         view = running(2, pause_when=PauseWhen(*when))
         assert view.task is not None and view.step is not None
         step = replace(view.step, qpos=np.zeros((2, 1), np.float32))

@@ -93,8 +93,8 @@ def test_the_innermost_line_of_the_author_is_named_and_ours_are_left_out() -> No
 
 @pytest.mark.parametrize("dump", ["", STACK])
 def test_slow_work_of_ours_is_told_from_that_of_a_hook(dump: str) -> None:
-    def seen(doing: Doing, **more: bool) -> tuple[bool, ...]:
-        busy = busy_at(9.0, doing, dump, [], more.pop("ignores", False), **more)
+    def seen(doing: Doing, ignores: bool = False, held: bool = False) -> tuple[bool, ...]:
+        busy = busy_at(9.0, doing, dump, [], ignores, held)
         return busy.drawing, busy.getting_ready, busy.ignores_interrupt, busy.held, busy.awaited
 
     ours = not dump
