@@ -38,9 +38,7 @@ class Batch:
         self.elapsed = np.zeros(ENVS, np.int32)
         geometry, _ = table_scene(ENVS)
         self.task = description(geometry, (camera(),))
-        self.gatherer = EpisodeGatherer(
-            self.task, self.env_idx, self.folder, self.ended.append, **self.named
-        )
+        self.gatherer = EpisodeGatherer(self.task, self.env_idx, self.folder, self.ended.append, **self.named)
 
     def reset(self, *envs: int, to: int = 0, **more: Any) -> None:
         self.elapsed = self.elapsed.copy()
@@ -104,7 +102,10 @@ def assert_rows(episode: Episode, env: int, taken: list[Stepped]) -> None:
     (track,) = episode.cameras
     assert track.rgb is not None
     assert [int(track.rgb[row].max()) for row in range(len(taken))] == [
-        int(picture.rgb.max()) for one in taken for picture in one.captured if picture.env == env  # type: ignore[union-attr]
+        int(picture.rgb.max())
+        for one in taken
+        for picture in one.captured
+        if picture.env == env  # type: ignore[union-attr]
     ]
     np.testing.assert_array_equal(track.pose[:, 0], np.full(len(taken), env))
 
