@@ -187,18 +187,18 @@ def test_a_failure_leaves_no_file_and_the_next_job_saves_all(fake: FakeWorkerSes
         (JobFailed("the process died"), "died"),
         (JobFailed("no", problem), "KeyError.*31"),
     ):
-        answer, saver.process.asked = saver.answer, []
+        saver.process.asked = []
 
         def fails(question: Any, failure: JobFailed = failure) -> Any:
             ends = isinstance(question, CaptureMoment) and len(saver.process.of(CaptureMoment)) == 3
-            return failure if ends else answer(question)
+            return failure if ends else saver.answer(question)
 
         saver.process.answer = fails
         ended = saver.save(wanted(fake, None))
         assert isinstance(ended, SaveFailed) and re.search(words, ended.why)
         until(lambda: not list(saver.folder.iterdir()), "no file of the failed job")
         assert not saver.finisher.finished.count
-        saver.process.answer = answer
+        saver.process.answer = saver.answer
     assert isinstance(saver.save(wanted(fake, (2, 0))), EpisodesSaved)
     assert set(saver.written()) == {0, 2}
 
