@@ -208,6 +208,21 @@ def test_one_each_ends_with_the_next_episode_of_each_env(tmp_path: Path) -> None
         one.writer.discard()
 
 
+def test_a_step_that_also_resets_an_env_is_a_step_of_the_others_only(tmp_path: Path) -> None:
+    batch = Batch(tmp_path, (0, 1))
+    batch.reset(0, 1)
+    batch.step()
+    elapsed = np.array([2, 0, 2, 2], np.int32)
+    both = moment(elapsed, (1,), number=2, seeds=np.arange(ENVS), **data(2))
+    action = np.full((ENVS, 2), 0.5, np.float32)
+    batch.gatherer.take(replace(both, step=replace(both.step, action=action)))
+    assert [(one.env, one.steps) for one in batch.ended] == [(1, 1)]
+    assert [(one.env, one.steps) for one in batch.gatherer.under_way] == [(0, 2), (1, 0)]
+    batch.gatherer.finish()
+    for one in batch.ended:
+        one.writer.discard()
+
+
 @pytest.mark.parametrize(("ends", "steps"), [("over", [1]), ("reset", [3])])
 def test_an_episode_ends_at_its_end_or_at_the_reset(tmp_path: Path, ends: str, steps: list[int]) -> None:
     batch = Batch(tmp_path, (1,), {"ends": ends})

@@ -250,6 +250,8 @@ def test_an_env_that_went_back_is_saved_along_its_own_past(fake: FakeWorkerSessi
         [found[serial].action[env] for serial, env in rows[1:]],  # type: ignore[index]
     )
     assert episode.info.acted_by == ((0, "hold"), (1, "sliders"))
+    (track,) = episode.cameras
+    assert track.rgb is not None and track.pose[:, 0].tolist() == [2, 2, 0], "pictures are of the other env"
     assert [one.env_idx for one in saver.process.of(CaptureMoment)] == [(2,), (2,), (0,)]
 
 

@@ -111,8 +111,6 @@ class ReviewComparePanel(PagePart[ReviewView]):
 
 
 def headline(found: Difference) -> str:
-    if not found.compared:
-        return "With this alignment, the two recordings do not overlap."
     if found.bodies is None:
         return "One of them has no scene; only numbers are compared."
     if found.bodies.position is None:

@@ -84,7 +84,7 @@ def difference(
     """
     begin = max(-anchors[0], -anchors[1])
     end = min(len(a.reward) - anchors[0], len(b.reward) - anchors[1])
-    count = max(0, end - begin + 1)
+    count = end - begin + 1  # at least position 0, which is a state of both
     rows = (
         slice(begin + anchors[0], begin + anchors[0] + count),
         slice(begin + anchors[1], begin + anchors[1] + count),
