@@ -124,3 +124,24 @@ def test_the_content_of_a_status_is_shown_as_text(tmp_path: Path) -> None:
     shown = render("library_jobs", jobs=jobs)
     assert "<script" not in shown and "&lt;script&gt;" in shown and "\x1b" not in shown
     assert "2 failed" in shown
+
+
+def test_jobs_are_listed_newest_first_and_each_is_due_once_a_second(tmp_path: Path) -> None:
+    now = 1e9
+    files = [StatusFile(tmp_path, lambda: now) for _ in range(3)]
+    for at, file in enumerate(files):
+        now = 1e9 + at
+        assert file.is_due()
+        file.write(replace(RUNS, done=at))
+        assert not file.is_due()
+        file.write(replace(RUNS, done=99))
+    now += 0.99
+    assert [file.is_due() for file in files] == [True, True, False]
+    assert [one.done for one in read_jobs(tmp_path, now)] == [2, 1, 0]
+    assert read_jobs(tmp_path, 1e9 - 60) == (), "a time to come is no time"
+    (tmp_path / "sub").mkdir()
+    StatusFile(tmp_path / "sub", lambda: now).write(replace(RUNS, done=7))
+    jobs = read_jobs(tmp_path, now, [tmp_path / "sub", tmp_path])
+    assert [(one.done, one.place) for one in jobs] == [(7, "sub"), (2, ""), (1, ""), (0, "")]
+    StatusFile(tmp_path / "absent", lambda: now).write(RUNS)
+    assert not (tmp_path / "absent").exists()

@@ -389,6 +389,46 @@ def test_deleting_moves_all_files_and_can_be_undone(tmp_path: Path, library: Lib
     assert [row.name for row in library.view().rows] == ["b", "sub/c"], "the last deletion is undone first"
 
 
+def test_the_trash_is_emptied_for_good_and_vanished_files_are_named(tmp_path: Path, library: Library) -> None:
+    seen: list[int] = []
+    for name in ("a", "b"):
+        describe(tmp_path, name, id=name * 4)
+    library.refresh()
+    library.on_change.add(lambda: seen.append(library.view().serial))
+    library.delete(["aaaa"])
+    assert seen and seen[-1] == library.view().serial and library.view().trash.files == 3
+    library.empty_trash()
+    assert library.view().trash.files == 0 and seen[-1] == library.view().serial
+    assert not [name for name in tree(tmp_path) if name.startswith(".trash/")]
+    with pytest.raises(LibraryError):
+        library.undo_delete()
+    for file in tmp_path.glob("b.*"):
+        file.unlink()
+    with pytest.raises(LibraryError):
+        library.delete(["bbbb"])
+    assert library.view().rows == () and library.row("bbbb") is None
+
+
+def test_a_copy_of_a_recording_is_a_row_of_its_own(tmp_path: Path, library: Library) -> None:
+    for name in ("a", "sub/b"):
+        path = tmp_path / name
+        describe(path.parent, path.name, id="same")
+    library.refresh()
+    first, second = library.view().rows
+    assert first.id == "same" != second.id and library.row(second.id) is second
+    library.set_note([second.id], "the copy")
+    assert [row.note for row in library.view().rows] == ["", "the copy"]
+    library.set_tags(["same", second.id], add=["x", "y"])
+    library.set_tags(["same"], remove=["x"])
+    assert [row.tags for row in library.view().rows] == [("y",), ("x", "y")]
+    before = tree(tmp_path), {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
+    library.set_tags(["same"], add=["y"], remove=["x"])
+    library.set_note(["same"], " ")
+    assert before == (tree(tmp_path), {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")})
+    library.delete([second.id])
+    assert [row.id for row in library.view().rows] == ["same"] == [row.id for row in read(tmp_path)]
+
+
 def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     tmp_path: Path, maniskill: Path, library: Library
 ) -> None:

@@ -119,3 +119,60 @@ def test_any_commands_select_only_listed_rows(happened: list[tuple[Command, Rows
         assert there.list.cursor is None or there.list.cursor in shown
         assert bool(there.page) == bool(there.rows) and set(there.page) <= set(there.rows)
         before = there
+
+
+def test_each_command_selects_orders_and_turns_as_it_says() -> None:
+    """Rows are newest first: r0, r1, r2 ..."""
+
+    def chosen(*commands: Command) -> tuple[str, ...]:
+        return after(commands).selected
+
+    three, five = PressRow(id="r3"), PressRow(id="r5", held="shift")
+    assert chosen(three) == ("r3",) == chosen(PressRow(id="r9"), OpenRow(id="r3"))
+    assert chosen(three, five) == ("r3", "r4", "r5")
+    assert chosen(PressRow(id="r5"), PressRow(id="r3", held="shift")) == ("r3", "r4", "r5")
+    assert chosen(three, five, PressRow(id="r4", held="shift")) == ("r3", "r4"), "the anchor stays"
+    assert chosen(three, PressRow(id="r7", held="ctrl")) == ("r3", "r7")
+    assert chosen(three, five, PressRow(id="r4", held="ctrl")) == ("r3", "r5")
+    assert chosen(three, PressRow(id="r7", held="ctrl"), PressRow(id="r9", held="ctrl+shift")) == (
+        "r3",
+        "r7",
+        "r8",
+        "r9",
+    )
+    assert chosen(three, ToggleRow()) == () and chosen(three, ToggleRow(), ToggleRow()) == ("r3",)
+    assert chosen(ToggleRow()) == () and chosen(PressRow(id="absent")) == ()
+    assert chosen(three, NextRow()) == ("r4",) and chosen(three, PreviousRow()) == ("r2",)
+    assert chosen(three, AlsoNextRow(), AlsoNextRow(), AlsoPreviousRow()) == ("r3", "r4")
+    assert chosen(three, AlsoPreviousRow()) == ("r2", "r3")
+    assert chosen(PressRow(id="r0"), PreviousRow()) == ("r0",)
+    last = ROWS[-1].id
+    assert chosen(PressRow(id=last), NextRow()) == (last,)
+    assert len(chosen(SelectAllRows())) == len(ROWS) and chosen(SelectAllRows(), SelectNoRows()) == ()
+    successes = chosen(FilterRows(outcome="success"), SelectAllRows())
+    assert successes == tuple(row.id for row in ROWS if row.success)
+    assert chosen(SelectAllRows(), FilterTask(task="pick"))[:2] == ("r0", "r3")
+    found = after([LookForRows(words="seed:7"), SelectAllRows()])
+    assert found.selected == ("r7",) == tuple(row.id for row in found.rows)
+    assert len(after([LookForRows(words="seed:7"), FilterTask(task="pick"), ClearRowFilter()]).rows) == len(
+        ROWS
+    )
+
+
+def test_pages_are_turned_and_begin_anew_with_another_order() -> None:
+    def first(*commands: Command) -> str:
+        return after(commands).page[0].id
+
+    second = f"r{ROWS_PER_PAGE}"
+    assert first() == "r0" and first(NextRows()) == second == first(NextRows(), NextRows())
+    assert first(NextRows(), PreviousRows()) == "r0" == first(PreviousRows())
+    assert len(after([NextRows()]).page) == 3
+    assert first(NextRows(), SortRows(column="seed")) == "r0"
+    assert first(SortRows(column="seed"), SortRows(column="seed")) == ROWS[-1].id, "the other direction"
+    assert first(SortRows(column="date")) == ROWS[-1].id and first(SortRows(column="steps")) == "r0"
+    assert first(NextRows(), FilterRows(outcome="success")) == "r0"
+    assert after([NextRows(), LookForRows(words="")]).page[0].id == second, "nothing has changed"
+    at = after([PressRow(id=f"r{ROWS_PER_PAGE - 1}"), NextRow()])
+    assert at.page[0].id == second and at.list.follow and at.list.cursor == second
+    assert not after([PressRow(id="r1")]).list.follow
+    assert after([NextRows(), NextRow()]).selected == (second,)

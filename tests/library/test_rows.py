@@ -10,7 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from workbench.episodes.row import LibraryRow, clean_facts
-from workbench.library.rows import COLUMNS, SECOND_LINE, Column, OpenVersion, cells, chosen, ordered
+from workbench.library.job_status import SILENT_SECONDS, JobFailure, JobStatus
+from workbench.library.rows import (
+    COLUMNS,
+    MEANS,
+    SECOND_LINE,
+    Column,
+    OpenVersion,
+    Outcome,
+    cells,
+    chosen,
+    count_recordings,
+    in_words,
+    job_text,
+    none_like_that,
+    ordered,
+)
 
 NOW = datetime.datetime(2026, 11, 21, 12, tzinfo=datetime.timezone.utc)
 
@@ -130,3 +145,88 @@ def test_a_nan_return_is_shown_and_sorts_last_in_both_orders() -> None:
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
     assert cells(lost, None, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "found"), [("all", "abcde"), ("success", "a"), ("no success", "bcd"), ("broken", "e")]
+)
+def test_a_filter_lists_the_rows_of_its_outcome_and_task(outcome: Outcome, found: str) -> None:
+    assert ids(chosen(ROWS, outcome=outcome)) == found
+    of_push = "".join(one for one in found if one in "abc")
+    assert ids(chosen(ROWS, outcome=outcome, task="Push-v1")) == of_push
+    assert "Push-v1" in none_like_that("", outcome, "Push-v1") and "odd" in none_like_that(
+        " odd ", outcome, None
+    )
+    assert len({none_like_that("", one, None) for one in MEANS}) == len(MEANS)
+
+
+def test_copies_and_exports_count_once() -> None:
+    rows = [
+        row("a", uid="u1"),
+        row("b", uid="u1"),
+        row("c", copy_of="u1", uid="u9"),
+        row("d", uid="u2"),
+        row("e", copy_of="u3"),
+        row("f"),
+        row("g"),
+    ]
+    assert count_recordings(rows) == 5
+    both = (Path("x.json"), Path("x.h5"))
+    words = in_words([row("a", paths=both), row("b", paths=both), row("c")])
+    assert "3 recordings" in words and "4 files" in words and "2" in words, "the shared files count once"
+    assert words.split("(")[1] == in_words([row("a", paths=both), row("c")]).split("(")[1]
+
+
+def test_a_rows_cells_are_its_own_facts() -> None:
+    zone = datetime.timezone(datetime.timedelta(hours=5))
+    now = NOW.astimezone(zone)
+    facts = {
+        "env_index": 3,
+        "control_mode": "pd_ee_delta_pose",
+        "acted_by": "policy act.py",
+        "total_reward": 2.5,
+        "source_hash": "0123456789ab",
+    }
+    found = cells(row("a", **facts), None, now)
+    assert (found["task"], found["total"], found["version"]) == ("Push-v1", "2.5", "0123456")
+    for part in ("name-a", "env 3", "pd_ee_delta_pose", "act.py"):
+        assert part in found["about"]
+    assert found["when"].startswith("2026-11-21 17:00") and found["date"].startswith("17:00")
+    assert not found["other_version"] and not found["remark"] and not found["outcome"]
+    dates = [
+        cells(row("a", written=(NOW - datetime.timedelta(days=days)).timestamp()), None, now)["date"]
+        for days in (0, 1, 40, 400)
+    ]
+    assert "20 Nov" in dates[1] and ":" in dates[1] and "12 Oct" in dates[2] and "2025" in dates[3]
+    assert cells(row("a", written=None), None, now)["date"] == ""
+    broken = cells(row("a", task="", problem="it is broken"), None, now)
+    assert (broken["task"], broken["total"]) == ("?", "") and "it is broken" in broken["about"]
+    remarks = [
+        cells(row("a", **given), None, now)["remark"]
+        for given in (
+            {"recovered": True},
+            {"kind": "maniskill"},
+            {"kind": "lerobot", "copy_of": "u1"},
+            {"kind": "rrd only"},
+            {"kind": "maniskill", "problem": "broken"},
+        )
+    ]
+    assert len(set(remarks)) == 5 and not remarks[4] and "export" in remarks[2] and "export" not in remarks[1]
+
+
+def test_a_jobs_text_is_its_state_its_rate_and_the_time_left() -> None:
+    job = JobStatus("record", "push.py", 40, 100, rate=2.0, written_at=1000.0)
+
+    def text(now: float = 1000.0, **changes: Any) -> str:
+        return job_text(replace(job, **changes), now)
+
+    assert "2.0 a second" in text() and "30 s" in text()
+    failed = (JobFailure("3, 4", 20, "no", ""),)
+    assert replace(job, failures=failed).failed == 20 and "20 s" in text(failures=failed)
+    assert "a minute" in text(rate=0.05) and "3.0" in text(rate=0.05) and "20 min" in text(rate=0.05)
+    assert "60 h" not in text(rate=0.0003) and " h" in text(rate=0.0003)
+    assert "a second" not in text(rate=0) and "left" not in text(rate=0) and text(rate=0)
+    states = [text(state=state) for state in ("done", "stopped", "failed")]
+    assert len(set(states)) == 3 and not any("left" in one or "a second" in one for one in states)
+    silent = 1000 + SILENT_SECONDS + 1
+    assert text(silent) not in (text(), *states) and text(silent, state="done") == text(state="done")

@@ -113,7 +113,7 @@ def assert_rows(episode: Episode, env: int, taken: list[Stepped]) -> None:
 def test_each_env_has_the_rows_of_its_own_episode(tmp_path: Path) -> None:
     batch = Batch(tmp_path, (3, 1, 0))
     batch.reset(0, 1, 2, 3)
-    batch.step()
+    batch.step(reward=[1, 10, 100, 1000])
     batch.step(success=(1,))
     batch.step(truncated=(0,), reward=[9, 8, 7, 6])
     batch.reset(1, 0)
@@ -133,11 +133,11 @@ def test_each_env_has_the_rows_of_its_own_episode(tmp_path: Path) -> None:
         assert_rows(episode, env, taken)
     results = {(one.env, one.seed): (one.steps, one.total_reward, one.success) for one in batch.ended}
     assert results == {
-        (1, 6): (2, 3.0, True),
+        (1, 6): (2, 10 + 2.0, True),
         (0, 5): (3, 1 + 2 + 9.0, False),
         (1, 46): (1, 1.0, False),
         (0, 45): (1, 1.0, False),
-        (3, 8): (4, 1 + 2 + 6 + 4.0, True),
+        (3, 8): (4, 1000 + 2 + 6 + 4.0, True),
     }
 
 
@@ -225,20 +225,24 @@ def test_a_step_that_also_resets_an_env_is_a_step_of_the_others_only(tmp_path: P
 
 @pytest.mark.parametrize(("ends", "steps"), [("over", [1]), ("reset", [3])])
 def test_an_episode_ends_at_its_end_or_at_the_reset(tmp_path: Path, ends: str, steps: list[int]) -> None:
-    batch = Batch(tmp_path, (1,), {"ends": ends})
-    batch.reset(1)
-    batch.step(fail=(1,))
+    batch = Batch(tmp_path, (1, 2), {"ends": ends})
+    batch.reset(1, 2)
+    batch.step(fail=(1,), truncated=(2,))
     batch.step()
     batch.step(success=(0,), evaluate={"success": np.array([[True, True], [False, True]] * 2)})
-    batch.reset(1)
-    assert [one.steps for one in batch.ended] == steps
+    batch.reset(1, 2)
+    assert [(one.env, one.steps) for one in batch.ended] == [
+        (env, count) for env in (1, 2) for count in steps
+    ]
     assert batch.ended[0].success is (ends == "reset")
-    batch.gatherer.drop(1)
-    assert batch.gatherer.env_idx == (1,) and not batch.gatherer.under_way
+    for env in (1, 2, 2):
+        batch.gatherer.drop(env)
+    assert batch.gatherer.env_idx == (1, 2) and not batch.gatherer.under_way
     batch.reset(1)
     batch.gatherer.finish()
-    assert len(batch.ended) == 1
-    batch.ended[0].writer.discard()
+    assert len(batch.ended) == 2
+    for one in batch.ended:
+        one.writer.discard()
     assert not list(tmp_path.iterdir())
 
 

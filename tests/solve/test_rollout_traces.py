@@ -9,7 +9,7 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
-from workbench.solve.rollout_traces import BEST, RolloutTraces, segments
+from workbench.solve.rollout_traces import BEST, CHOSEN, MAX_SEGMENTS, RolloutTraces, segments
 
 HERE = np.zeros(3, np.float32)
 
@@ -47,3 +47,23 @@ def test_one_node_draws_all_paths_at_the_envs_offset(server: viser.ViserServer, 
     assert panels.nodes("/rollouts") == []
     traces.draw(np.zeros((0, 0, 3), np.float32), HERE)
     assert panels.nodes("/rollouts") == []
+
+
+def test_the_chosen_path_is_marked_and_what_is_not_finite_is_left_out(
+    server: viser.ViserServer, panels: Panels
+) -> None:
+    paths = paths_along_x()
+    points, colours = segments(paths, 3)
+    tones = {int(y): tuple(colours[points[:, 0, 1] == y][0, 0]) for y in range(5)}
+    assert tones[0] == BEST and tones[3] == CHOSEN and len(set(tones.values())) == 5
+    assert {int(y) for y in points[-8:, 0, 1]} == {0, 3}, "drawn last, over the others"
+    paths[1, 2] = np.nan
+    points, _ = segments(paths, 9)
+    assert len(points) == 18 and np.isfinite(points).all()
+    traces, long = RolloutTraces(server), paths_along_x(2, 60)
+    for offset, chosen in ((0, 0), (4, 0), (4, 1)):
+        traces.draw(long, np.array([0, offset, 0], np.float32), chosen)
+        (node,) = panels.nodes("/rollouts")
+        assert node.points[..., 1].min() == offset and node.points[..., 0].max() == 60
+        assert (np.asarray(node.colors) == CHOSEN).all(-1).any() == bool(chosen)
+        assert len(node.points) == 2 * MAX_SEGMENTS
