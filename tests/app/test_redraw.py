@@ -22,13 +22,17 @@ from workbench.checks.results import HookTime, RuleResult, StepProfile
 from workbench.checks.state import ChecksView
 from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.envs.gpu_rules import Finding
-from workbench.envs.inspection import Inspection, Leaf
+from workbench.envs.inspection import BodyReadings, Inspection, Leaf
 from workbench.envs.keywords import HowMade, Keyword
 from workbench.envs.robots import Joint, JointTarget, RobotDescription, RobotKeyframe, RobotLink
 from workbench.hands.joints_panel import TITLE as JOINTS
 from workbench.hands.reach import Reach
 from workbench.hands.reset_until import ResetSearch
+from workbench.hands.resets import ResetCloud
+from workbench.hands.spawn import SpawnBox
+from workbench.hands.start_edit import BodyPose, RobotQpos, StartEdit
 from workbench.hands.state import DraggedJoint, Hands
+from workbench.live.commands import SelectBody
 from workbench.live.history.curves import Column
 from workbench.live.history.moments import RESET, SUCCESS, EpisodeNumbers
 from workbench.live.messages import ReloadReport, RulesBroken
@@ -50,6 +54,7 @@ from workbench.rescore.verdict import Verdict
 from workbench.solve.seeds import SeedsView
 from workbench.solve.state import SolveView
 from workbench.task.description import TaskOptions
+from workbench.task.write_edits import SourceEdit
 
 pytestmark = pytest.mark.thorough
 
@@ -66,6 +71,18 @@ ARM = RobotDescription(
     (RobotKeyframe("rest", (0.0,), None),),
 )
 KEY = CAMERA.key
+EDIT = SourceEdit("/home/me/push.py", "x = 1\n", "x = 2\n", (), None)
+HAND = BodyReadings(
+    "arm/hand",
+    0.125,
+    np.ones(3, np.float32),
+    np.zeros(3, np.float32),
+    None,
+    None,
+    True,
+    ("box",),
+    ((0.3, 0.3, 0),),
+)
 PAST = TimelineView(0, 40, None, 0, 40, 40, 2**20, 2**28, 41)
 
 
@@ -210,6 +227,11 @@ CHANGES: dict[str, Any] = {
     "a condition to pause at": just(pause_when=PauseWhen("reward", "rises above", 0.5)),
     "a search for a first state": just(search=ResetSearch("running", PauseWhen("success"), 8, 40, 4)),
     "a pause at a condition": just(pause_when=PauseWhen("success"), paused_at=30),
+    "the range of a body": just(spawn=SpawnBox("measured", 1, "arm/hand", ((0, 1), (0, 1)), ((0, 1), None), ((0, 1), None))),
+    "where a body shall begin": just(start=StartEdit("planned", 1, BodyPose("cube", _HERE), EDIT, "a message")),
+    "where a robot shall begin": just(start=StartEdit("refused", 1, RobotQpos("arm", (0.0,)), None, "a message", "x = 1")),
+    "sampled resets": just(cloud=ResetCloud("failed", 1, why="no")),
+    "the selected body": lambda view: {"inspection": replace(view.inspection, body=HAND)},
     "a picture": just(pictures=picture(200), pictures_serial=2),
     "a camera that fails": just(failed_cameras={KEY: "It cannot be drawn."}),
 }  # fmt: skip
@@ -231,6 +253,7 @@ def made() -> Live:
         "rescored_curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.do(ToggleTable())
+    live.do(SelectBody(body="arm/hand"))  # a link: paused, it has no grip, whose name counts up
     live.do(TellUnfolded(panel=JOINTS))
     return live
 

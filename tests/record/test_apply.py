@@ -45,6 +45,7 @@ from workbench.record.commands import (
 from workbench.record.gather import Finished
 from workbench.record.saving_state import (
     BeginSaving,
+    EndSaving,
     EpisodesKept,
     EpisodesSaved,
     KeptEpisodes,
@@ -58,10 +59,12 @@ from workbench.record.state import (
     BeginEpisodes,
     EndEpisodes,
     EpisodeEnded,
+    EpisodesEnded,
     EpisodesRecovered,
     EpisodeWritten,
     LiveRecording,
     RecordEffect,
+    RecordingStatus,
     RecordingWanted,
     RunningEpisodes,
     StepRecorded,
@@ -320,6 +323,114 @@ def test_a_rescoring_stopped_by_a_save_restarts_if_the_version_stays_the_same() 
 def test_an_episode_saved_from_the_past_does_not_count_as_recorded() -> None:
     state, _ = after(loaded(), Asked(ToggleRecording()), EpisodeEnded(live=True), EpisodeEnded(live=False))
     assert (state.recording.episodes, state.recording.being_written) == (1, 2)
+
+
+def test_a_recording_ends_env_by_env_and_is_saved_once_its_files_are_written() -> None:
+    state, effects = after(loaded(), RESET, RecordingWanted(next_episode=True))
+    number = state.recording.number
+    assert [type(one) for one in effects] == [BeginEpisodes, Send], "no env is reset"
+    assert effects[0].one_each and effects[1] == Send(SetCapture((0, 1, 2), from_reset=True))  # type: ignore[union-attr]
+
+    def tell(event: SessionEvent) -> list[Effect]:
+        nonlocal state
+        state, effects = apply_filtered(state, event)
+        return effects
+
+    def shown() -> RecordingStatus:
+        return state.recording.status(state.run)
+
+    assert (shown().active, shown().waiting, shown().since, shown().saved) == (True, 3, NOW.wall, None)
+    tell(stepped(0, (0, 2)))
+    assert tell(StepRecorded(number, 5, (0, 1, 2), RunningEpisodes(2, 7, 300))) == []
+    assert (shown().waiting, shown().steps, shown().bytes_written) == (1, 7, 300)
+    assert tell(StepRecorded(number, 0, (2, 1), RunningEpisodes(1, 4, 200))) == [
+        Send(SetCapture((1, 2), from_reset=True))
+    ]
+    assert (shown().env_idx, shown().waiting, shown().steps) == ((1, 2), 1, 4)
+    tell(EpisodeEnded(live=True))
+    tell(EpisodeWritten(Finished(1, 1000, None, None)))
+    assert (shown().episodes, shown().being_written, shown().episodes_written) == (1, 0, 1)
+    assert shown().bytes_written == 1200 and shown().saved is None
+    assert tell(StepRecorded(number, 0, (), RunningEpisodes())) == [
+        Send(SetCapture((), from_reset=True)),
+        EndEpisodes(),
+    ]
+    tell(EpisodeEnded(live=True))
+    tell(EpisodesEnded(number - 1))
+    assert shown().saved is None and not shown().active
+    tell(EpisodesEnded(number))
+    assert shown().saved is None, "its last file is being written"
+    tell(EpisodeWritten(Finished(2, 2000)))
+    assert (shown().saved, shown().waiting, shown().bytes_written) == (2, 0, 2000)
+    tell(Asked(ToggleRecording()))
+    assert (shown().saved, shown().episodes, shown().env_idx) == (None, 0, (0,)), "the chosen env"
+    begun = state.recording.number
+    tell(Asked(StopRecording()))
+    tell(EpisodesEnded(begun))
+    assert shown().saved == 0, "the files of the recording before do not count"
+    tell(Asked(ChooseRecordedEnvs(envs="all")))
+    assert tell(Asked(RecordNextEpisode()))[0] == BeginEpisodes(begun + 1, state.run.task, (0, 1, 2), True)  # type: ignore[arg-type]
+    assert tell(StepRecorded(begun + 1, 0, (0, 1, 2), RunningEpisodes(), "the disk is full")) == [
+        EndEpisodes(),
+        Send(SetCapture(())),
+    ]
+    assert shown().problem == "the disk is full" and not shown().active
+    tell(EpisodesRecovered(("a.rrd",), None))
+    assert shown().recovered == ("a.rrd",) and shown().problem == "the disk is full"
+    tell(Asked(RecordNextEpisode()))
+    assert shown().problem is None
+
+
+@pytest.mark.parametrize("one_each", [False, True])
+@pytest.mark.parametrize("level", ["patched", "rebuilt", "restarted"])
+def test_after_a_load_the_envs_are_reset_only_if_they_lost_their_place(level: str, one_each: bool) -> None:
+    begun = loaded(), RESET, RecordingWanted((0, 2), next_episode=one_each), RESET, STEP
+    state, effects = after(*begun, loaded(level, "b"))
+    assert EndEpisodes() in effects and not state.recording.env_idx and not state.recording.ended
+    put_back = state.recording.continues is not None and state.recording.continues.put_back
+    assert put_back == (level == "patched")
+    ended, _ = apply_filtered(state, EpisodesEnded(state.recording.number))
+    assert not ended.recording.ended, "it goes on"
+    state, effects = apply_filtered(state, LoadDone())
+    (begin,) = [one for one in effects if isinstance(one, BeginEpisodes)]
+    assert begin.env_idx == (0, 2) == state.recording.env_idx and begin.one_each == one_each
+    assert (Then(EnvsReset((0, 2))) in effects) == (not put_back and not one_each)
+    again, effects = apply_filtered(state, LoadDone())
+    assert again.recording == state.recording
+
+
+def test_what_is_not_saved_yet_is_counted_and_a_failure_stays_named() -> None:
+    """The text is asked for when the server ends."""
+    success = moment(np.full(ENVS, 1, np.int32), success=(1,), number=1)
+    state, _ = after(loaded(), RESET, success, SaveWanted(None))
+    saving = state.recording.saving
+    assert saving.unsaved == ENVS and str(ENVS) in saving.text
+    state, _ = apply_filtered(state, SaveProgressed(1, JobProgress("drawing", 4, 9)))
+    assert "drawing" in state.recording.saving.text and "4" in state.recording.saving.text
+    stale, _ = apply_filtered(state, SaveProgressed(7, JobProgress("late", 1, 1)))
+    assert stale.recording.saving == state.recording.saving
+    (ends, succeeds) = (
+        {one.env: getattr(one, name) for one in saving.running.episodes} for name in ("ended", "succeeded")
+    )  # type: ignore[union-attr]
+    assert ends == succeeds == {0: False, 1: True, 2: False}
+    state, _ = apply_filtered(state, SaveWanted((2,)))
+    assert state.recording.saving.unsaved == ENVS + 1
+    state, _ = apply_filtered(state, SaveFailed(1, "the disk is full"))
+    status = state.recording.status(state.run).saving
+    assert (status.failed, status.message) == (True, "the disk is full") and status.progress is not None
+    state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))
+    status = state.recording.status(state.run).saving
+    assert (status.failed, status.message, status.progress) == (False, "saved", None)
+    assert not state.recording.saving.text
+    same, _ = apply_filtered(state, loaded("same"))
+    assert same.recording.saving.status.message == "saved"
+    other, _ = apply_filtered(state, loaded("patched", "b"))
+    assert not other.recording.saving.status.message
+    state, (begin,) = apply_filtered(state, SaveWanted((0,)))
+    assert isinstance(begin, BeginSaving) and not state.recording.saving.status.message
+    state, effects = apply_filtered(state, Asked(ToggleSavePast()))
+    assert effects == [EndSaving()] and state.recording.saving.status.message
+    assert state.recording.saving.status.progress is None and not state.recording.saving.requests
 
 
 def test_every_command_of_these_features_is_handled() -> None:
