@@ -217,9 +217,11 @@ class FakeJob:
 
     def __init__(self) -> None:
         self.view = RescoreView()
+        self.started: list[tuple[list[str], dict[str, object]]] = []
 
-    def start(self, *args: object, **named: object) -> None:
-        """Do nothing; no job runs here."""
+    def start(self, files: list[Source], **named: object) -> None:
+        """Only store the ids and the options; no job runs here."""
+        self.started.append(([file.id for file in files], named))
 
     def do(self, command: StopRescoring) -> None:
         self.view = replace(self.view, state="stopped")
@@ -268,6 +270,49 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     rescoring.draw(replace(rescoring.job.view, serial=2))
     assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Rescore the open recordings")
     assert "wb-selected" in rescoring.panels.html()
+
+
+def test_an_open_recording_is_selected_and_shown_where_it_differs(
+    rescoring: Rescoring, library: Library, review: Review
+) -> None:
+    ids = {row.seed: row.id for row in library.view().rows}
+    review.open(list(ids.values()))
+    until(lambda: len(review.view().opened) == 3 and not review.view().loading, "the recordings")
+    for seed, at in ((2, 3), (3, 1), (1, None)):
+        given = verdict(ids[seed], seed=seed, first_difference=at, new_reward=np.arange(5) * np.float32(2))
+        rescoring.draw(RescoreView("done", 1, (given,), 3, 3))
+        rescoring.panels.ask(ShowRescored(run=ids[seed]))
+        view = review.view()
+        assert view.chosen is not None and view.chosen.id == ids[seed] and len(view.opened) == 3
+        assert view.position == (1 if at is None else at)
+        rescoring.draw(rescoring.job.view)
+        (chart,) = rescoring.panels.charts()
+        assert str(seed) in chart.title and len(chart.lines) == 2
+        old, new = (points[:, 1] for _, points in chart.lines)
+        assert (old.max(), new.max()) == pytest.approx((4, 8), abs=0.05)
+
+
+def test_recordings_are_rescored_with_the_chosen_code(
+    rescoring: Rescoring, library: Library, review: Review
+) -> None:
+    ids = {row.seed: row.id for row in library.view().rows}
+    wanted = [ids[2], ids[1]]
+    rescoring.draw(RescoreView())
+    rescoring.panel.rescore_and_notify(wanted)
+    rescoring.panel.rescore_and_notify([])
+    rescoring.panels.set("Recorded states", True)
+    rescoring.panels.set("Code", "today's")
+    review.open(wanted)
+    until(lambda: len(review.view().opened) == 2 and not review.view().loading, "the recordings")
+    rescoring.draw(RescoreView())
+    rescoring.panels.press("Rescore the open recordings")
+    assert rescoring.job.started == [
+        (wanted, {"file": None, "recorded_source": True, "use_env_states": False}),
+        (
+            [one.id for one in review.view().opened],
+            {"file": None, "recorded_source": False, "use_env_states": True},
+        ),
+    ]
 
 
 def test_a_row_names_the_changes_and_an_unchanged_row_is_paler(rescoring: Rescoring) -> None:

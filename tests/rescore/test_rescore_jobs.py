@@ -285,8 +285,15 @@ def test_a_task_that_fails_is_a_row_and_the_others_are_rescored(recordings: Reco
     recordings.unopened = {"A-v1", "B-v1", "C-v1"}
     view = recordings.rescore("failed")
     assert view.problem == PROBLEM and len(view.verdicts) == 4 and recordings.process.ended == 2
+    assert view.why not in third, "that its code cannot be opened is another reason"
+    recordings.files[0].path.write_text("{")
+    recordings.files[0].path.with_suffix(".rrd").unlink()
+    recordings.files[0].path.with_suffix(".h5").unlink()
     recordings.raises, recordings.unopened = {}, set()
-    assert not any(verdict.why_not for verdict in recordings.rescore("done").verdicts[:1])
+    broken, *whole = recordings.rescore("done").verdicts
+    assert broken.of == recordings.files[0] and broken.damaged and broken.why_not
+    assert [verdict.of for verdict in whole] == [recordings.files[at] for at in (1, 2, 3)]
+    assert not any(verdict.why_not for verdict in whole)
 
 
 def test_a_stopped_rescoring_keeps_its_rows_and_goes_no_further(recordings: Recordings) -> None:

@@ -151,13 +151,14 @@ def test_playback_shows_each_state_for_its_time_and_ends_or_begins_again() -> No
     state = after(state, review.ChoosePlaybackSpeed(speed=2.0), TogglePlay(), now=10.0)  # 40 states a second
     assert state.view.playing
     for elapsed, position, wait in ((0.0, 0, 0.025), (0.01, 0, 0.015), (0.03, 1, 0.02), (0.099, 3, 0.001)):
-        assert advanced(state, 10 + elapsed).view.position == position
+        shown = advanced(state, 10 + elapsed).view
+        assert (shown.position, shown.playing) == (position, True)
         assert next_position_in(state, 10 + elapsed) == pytest.approx(wait, abs=1e-6)
     ended = advanced(state, 10.11)
     assert (ended.view.position, ended.view.playing) == (3, False)
     assert after(ended, TogglePlay(), now=11.0).view.position == 0, "it begins again"
     loop = after(state, review.LoopPlayback(on=True), now=10.0)
-    again = advanced(loop, 10.11)
+    again = advanced(advanced(loop, 10.099), 10.11)
     assert (again.view.position, again.view.playing) == (0, True)
     assert advanced(again, 10.11 + 0.06).view.position == 2
     assert after(loop, review.LoopPlayback(on=False), now=10.0).view.loop is False
