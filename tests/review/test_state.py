@@ -90,6 +90,8 @@ def test_when_aligned_all_show_the_event_and_one_without_it_its_start() -> None:
     assert view.states == (5, 8, 1)
     assert "C" in unaligned_text(view) and "A" not in unaligned_text(view) and "B" not in unaligned_text(view)
     assert not unaligned_text(three().view)
+    of_b = after(three(), review.SelectRecording(id="b"), timeline.Seek(step=5), SUCCESS).view
+    assert of_b.position == -2 and of_b.states[1] == 5
     back = after(state, review.AlignRecordings(at="start")).view
     assert (back.anchors, back.first, back.last, back.position) == ((0, 0, 0), 0, 12, 5)
     with pytest.raises(Refused):
@@ -254,6 +256,19 @@ def test_the_first_recordings_are_shown_while_others_are_read_and_nothing_moves_
     broken = replace(recordings["a"].episode, broken_files=(BrokenFile("a.h5", "is gone"),))
     state, _ = apply(state, RecordingRead(again.opening, replace(recordings["a"], episode=broken), {}), 2.0)
     assert any("a.h5" in problem for problem in state.view.problems)
+
+
+def test_recordings_that_are_closed_while_others_are_read_stay_closed() -> None:
+    state, _ = apply(ReviewState(), listed([row(name, at) for at, name in enumerate("abc")]), 0.0)
+    state, begun = opening(state, Open(("a", "b", "c")))
+    assert begun is not None
+    for at, name in enumerate("ab"):
+        state, _ = apply(state, RecordingRead(begun.opening, recording(name, 8, minute=at), {}), at * 1.0)
+    state = after(state, review.CloseRecording(id="a"), review.CloseRecording(id="b"), now=1.1)
+    assert state.view.chosen is None
+    state, _ = apply(state, RecordingRead(begun.opening, recording("c", 8, minute=2), {}), 1.2)
+    state, _ = apply(state, ReadingEnded(begun.opening), 1.3)
+    assert [one.id for one in state.view.opened] == ["c"]
 
 
 def test_the_first_recording_is_opened_once_it_is_listed_and_readable() -> None:
