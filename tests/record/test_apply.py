@@ -357,7 +357,7 @@ def test_a_recording_ends_env_by_env_and_is_saved_once_its_files_are_written() -
     ]
     tell(EpisodeEnded(live=True))
     tell(EpisodesEnded(number - 1))
-    assert shown().saved is None and not shown().active
+    assert not state.recording.ended and not shown().active
     tell(EpisodesEnded(number))
     assert shown().saved is None, "its last file is being written"
     tell(EpisodeWritten(Finished(2, 2000)))
@@ -428,6 +428,7 @@ def test_what_is_not_saved_yet_is_counted_and_a_failure_stays_named() -> None:
     assert not other.recording.saving.status.message
     state, (begin,) = apply_filtered(state, SaveWanted((0,)))
     assert isinstance(begin, BeginSaving) and not state.recording.saving.status.message
+    state, _ = apply_filtered(state, SaveWanted((1,)))
     state, effects = apply_filtered(state, Asked(ToggleSavePast()))
     assert effects == [EndSaving()] and state.recording.saving.status.message
     assert state.recording.saving.status.progress is None and not state.recording.saving.requests

@@ -255,16 +255,19 @@ def test_the_chosen_entry_is_drawn_for_all_and_the_terms_for_the_selected_record
     (terms,) = (chart for title, chart in charts().items() if title.startswith(f"{ACTION}, "))
     assert all(set(points[:, 1].round(2)) == {2.0} for _, points in terms.lines)
     assert terms.title.endswith("B") and len(terms.lines) == 2
+    assert {tuple(points[[0, -1], 0].round(1)) for _, points in terms.lines} == {(-1.0, 4.0)}, (
+        "as B is aligned"
+    )
 
 
 def test_differences_count_from_the_alignment() -> None:
     a, b = made(8), made(10)
-    a.evaluate |= {"corner": np.zeros((9, 2)), "near": np.zeros(9, bool)}
-    b.evaluate |= {"corner": np.zeros((11, 2)), "near": np.zeros(11, bool)}
+    a.evaluate |= {"corner": np.zeros((9, 3)), "near": np.zeros(9, bool)}
+    b.evaluate |= {"corner": np.zeros((11, 3)), "near": np.zeros(11, bool)}
     for one in (a, b):
         poses_of(one)[:, BODY["cube"], 0] = 0
         one.reward[:], one.evaluate["distance"][:], one.evaluate["reward_terms/reach"][:] = 1, 0, 0
-    b.evaluate["corner"][6, 1] = 2.5
+    b.evaluate["corner"][6, 1:] = (2.5, 3)
     b.evaluate["corner"][9, 0] = -4
     b.evaluate["near"][5] = True
     poses_of(b)[7:, BODY["cube"], 2] += 0.25
@@ -348,9 +351,10 @@ def test_a_recording_goes_on_live_from_its_own_state(panels: Panels) -> None:
 
 
 def test_the_pose_of_a_body_is_that_of_the_selected_recording_and_state() -> None:
-    view = after(three(), Seek(step=4)).view
+    view = after(three(), Seek(step=4), AlignRecordings(at="first success")).view
+    assert view.states == (4, 7, 0)
     poses_of(view.opened[0].episode)[4, BODY["cube"], :3] = (0.125, 0.25, 0.375)
-    poses_of(view.opened[1].episode)[4, BODY["cube"], :3] = (0.5, 0.625, 0.75)
+    poses_of(view.opened[1].episode)[7, BODY["cube"], :3] = (0.5, 0.625, 0.75)
     assert "0.375" in body_html("cube", view) and "0.75" not in body_html("cube", view)
     other = body_html("cube", replace(view, selected=1))
     assert "0.625" in other and "0.375" not in other

@@ -297,6 +297,8 @@ def test_seeds_are_solved_reported_and_stopped(played: FakeWorkerSession, begun:
     assert (seen().state, seen().why, seen().problem) == ("failed", "the task failed", PROBLEM)
     session.do(SolveSeeds())
     assert (seen().why, seen().problem) == ("", None)
+    session.happen(SeedsUpdate(report=report))
+    assert (seen().state, seen().report) == ("solving", report)
     session.happen(SeedsUpdate("seed 4", 4.5))
     session.happen(SeedsDone())
     assert (seen().state, seen().activity, len(begun)) == ("done", "", 4)
