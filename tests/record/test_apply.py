@@ -409,10 +409,9 @@ def test_what_is_not_saved_yet_is_counted_and_a_failure_stays_named() -> None:
     assert "drawing" in state.recording.saving.text and "4" in state.recording.saving.text
     stale, _ = apply_filtered(state, SaveProgressed(7, JobProgress("late", 1, 1)))
     assert stale.recording.saving == state.recording.saving
-    (ends, succeeds) = (
-        {one.env: getattr(one, name) for one in saving.running.episodes} for name in ("ended", "succeeded")
-    )  # type: ignore[union-attr]
-    assert ends == succeeds == {0: False, 1: True, 2: False}
+    assert saving.running is not None
+    for name in ("ended", "succeeded"):
+        assert [getattr(one, name) for one in saving.running.episodes] == [False, True, False]
     state, _ = apply_filtered(state, SaveWanted((2,)))
     assert state.recording.saving.unsaved == ENVS + 1
     state, _ = apply_filtered(state, SaveFailed(1, "the disk is full"))

@@ -64,7 +64,8 @@ class Saver:
 
     def answer(self, question: Any) -> Any:
         if isinstance(question, Reset):
-            (env,) = question.env_idx or ()
+            assert question.env_idx is not None
+            (env,) = question.env_idx
             first = next(one for one in moments_of(self.fake.session) if one.seeds is not None)
             first = first.step
             poses = first.poses.copy()

@@ -61,7 +61,9 @@ def with_opened(*opened: Opened) -> ReviewState:
 
 def three() -> ReviewState:
     rows = zip("abc", LENGTHS, SUCCESSES, strict=True)
-    return with_opened(*(recording(name, *of, minute=at) for at, (name, *of) in enumerate(rows)))
+    return with_opened(
+        *(recording(name, steps, success, at) for at, (name, steps, success) in enumerate(rows))
+    )
 
 
 def after(state: ReviewState, *commands: Command, now: float = 0.0) -> ReviewState:
