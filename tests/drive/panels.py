@@ -24,7 +24,8 @@ from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 from tests.drive.charts import Chart, charts_in
 from tests.drive.own_controls import Controls, SeenButton, SeenField
 from workbench.commands import COMMANDS
-from workbench.machine.loop import do, result_of
+from workbench.machine.loop import do as on_loop
+from workbench.machine.loop import result_of
 from workbench.page.command import Command, Refused
 from workbench.page.door.gated_server import GatedServer
 from workbench.page.widgets.parts import Parts
@@ -346,7 +347,18 @@ class Panels:
         event = viser.SceneClickEvent(self.client, self.client.client_id, *ray, (0.5, 0.5), None)  # type: ignore[arg-type]
         for entry in list(self.server.scene._scene_pointer_cb):
             asyncio.run(entry.callback(event))  # type: ignore[arg-type]
-        do(lambda: None)  # the page handles the click on its loop
+        on_loop(lambda: None)  # the page handles the click on its loop
+
+    def turn(self, gizmo: str, pose: np.ndarray, phase: str = "update") -> None:
+        """Drag the handles of this name to a pose (7,) in the view."""
+        (handle,) = self.nodes(gizmo)
+        target = SimpleNamespace(position=pose[:3], wxyz=pose[3:])
+        event = SimpleNamespace(
+            client=self.client, client_id=self.client.client_id, phase=phase, target=target
+        )
+        for callback in handle._impl_aux.update_cb:
+            asyncio.run_coroutine_threadsafe(callback(event), self.server.gui._event_loop).result(60)
+        on_loop(lambda: None)
 
     def settle(self) -> None:
         """Wait until viser's event loop and the jobs that it started are done."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from tests.drive.scenes import changed, running
 from workbench.envs.keywords import HowMade, Keyword
 from workbench.envs.robots import Joint, JointTarget, RobotDescription, RobotKeyframe, RobotLink
 from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe
+from workbench.hands.joints import keyframe_code, qpos_code
 from workbench.hands.joints_panel import PAST, TITLE, short_names, with_dragged_joint
 from workbench.hands.state import DraggedJoint, Hands
 from workbench.live.view import SessionView
@@ -72,6 +74,25 @@ def test_the_sliders_of_several_robots_are_named_by_the_robot(live_page: Live) -
     run = unfold(live_page, view_of(ARM, other))
     assert f"{TITLE} \N{MIDDLE DOT} 2 robots" in live_page.folders()
     assert "<b>arm</b>" in run.html() and "<b>other</b>" in run.html()
+
+
+def test_the_texts_to_copy_are_those_of_each_robot_in_the_selected_env(live_page: Live) -> None:
+    wrist = RobotDescription(
+        "other", (Joint("wrist", True, 0.0, 1.0, 1),), (RobotLink(HAND, -1, -1, HERE, HERE),)
+    )
+    view = view_of(ARM, wrist)
+    assert view.step is not None
+    poses = view.step.poses.copy()
+    poses[:, :, 0] = np.arange(3)[:, None] + np.arange(poses.shape[1]) / 8
+    run = unfold(live_page, replace(view, step=replace(view.step, poses=poses)))
+    html = unescape(run.html())
+    for code in (
+        qpos_code([math.pi, 0.2]),
+        keyframe_code([math.pi, 0.2], poses[1, 0]),
+        qpos_code([0.2]),
+        keyframe_code([0.2], poses[1, HAND]),
+    ):
+        assert code in html
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ from tests.drive.hands import OFFSET, Hands
 from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
+from workbench.envs.inspection import BodyReadings, LinkJoint
 from workbench.hands.commands import FrameBody, HideBody, MeasureFrom, ShowHiddenBodies, TrackBody
-from workbench.hands.look import BodyView
+from workbench.hands.look import AXIS_METRES, BodyView
 from workbench.live.commands import FindBodies, SelectBody
 from workbench.page.command import Refused
 
@@ -98,6 +99,52 @@ def test_the_viewpoint_follows_the_body_but_not_to_another_env(
     page.draw(page.hands.poses)
     page.draw(page.moved([0.5, 0, 0]))
     np.testing.assert_allclose(page.camera.position, [6.2, 0, 1.2], atol=1e-6)
+
+
+def test_the_centre_of_mass_and_the_joint_are_drawn_in_the_frame_of_the_turned_body(
+    panels: Panels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = Page(panels, monkeypatch)
+    poses = page.moved([0.1, 0.2, 0.3])
+    # A quarter turn about z: x of the body is y of the env.
+    poses[1, page.hands.geometry.body_names.index("cube"), 3:] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    place = poses[1, page.hands.geometry.body_names.index("cube"), :3] + OFFSET
+    hinge = LinkJoint(
+        "hinge", "revolute", 0, 1, np.array([0.1, 0, 0], np.float32), np.array([0, 0, 1], np.float32)
+    )
+    of_cube = BodyReadings(
+        "cube", 1.0, None, np.array([0.02, 0, 0.01], np.float32), None, None, True, (), (), hinge
+    )
+
+    def drawn(read: BodyReadings | None) -> tuple[list, list]:
+        page.hands.panel.draw_in_view(page.hands.view, poses, OFFSET)
+        page.part.draw_in_view(page.hands.view, poses, OFFSET, read)
+        return panels.nodes("/hands/mass"), panels.nodes("/hands/joint_axis")
+
+    (mass,), (axis,) = drawn(of_cube)
+    np.testing.assert_allclose(mass.position, place + [0, 0.02, 0.01], atol=1e-6)
+    ends = place + [[0, 0.1, -AXIS_METRES], [0, 0.1, AXIS_METRES]]
+    np.testing.assert_allclose(axis.points.reshape(2, 3), ends, atol=1e-6)
+    for read in (replace(of_cube, name="arm/hand"), replace(of_cube, centre_of_mass=None, joint=None), None):
+        assert drawn(read) == ([], [])
+
+
+def test_the_measured_line_joins_the_bodies_of_the_selected_env(live_page: Live) -> None:
+    view = running(3, selected_env=1)
+    assert view.task is not None and view.step is not None
+    live_page.do(SelectBody(body="arm/hand"))
+    live_page.show(view)
+    live_page.do(MeasureFrom())
+    live_page.do(SelectBody(body="cube"))
+    live_page.show(view)
+    names = view.task.geometry.body_names
+    hand, cube = (view.step.poses[1, names.index(name), :3] for name in ("arm/hand", "cube"))
+    line, label = live_page.nodes("/hands/distance")
+    start, end = np.array(line.points).reshape(2, 3)
+    np.testing.assert_allclose(end - start, cube - hand, atol=1e-6)
+    np.testing.assert_allclose(label.position, (start + end) / 2, atol=1e-5)
+    (drawn,) = live_page.bodies("cube")
+    np.testing.assert_allclose(drawn.batched_positions[-1], end, atol=1e-6)
 
 
 def test_framing_looks_at_the_body_from_where_the_user_stands(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
@@ -21,15 +22,16 @@ from workbench.hands.commands import (
     ToggleHandles,
     WriteBodyPose,
 )
-from workbench.hands.start_edit import StartEdit, StartWanted
+from workbench.hands.start_edit import BodyPose, StartEdit, StartWanted
 from workbench.hands.state import BodyMoved, BodyPulled
 from workbench.hands.state import Hands as State
 from workbench.live.commands import SelectBody
 from workbench.live.messages import PullBody
 from workbench.page.command import Refused
+from workbench.pictures.camera_conventions import quaternion_from_rpy, rpy_of
 from workbench.record.saving_state import KeptEpisodes
 from workbench.record.state import RecordingStatus
-from workbench.task.description import ActionDimension
+from workbench.task.description import ActionDimension, ArmDescription, Pulled
 from workbench.task.write_edits import SourceEdit
 
 
@@ -152,6 +154,56 @@ def test_a_reset_ends_the_pull_and_the_drag_in_the_browser(
     assert now != dragged, "the browser would go on dragging the node"
 
 
+TURNED = np.array([np.cos(0.3), 0.0, 0.0, np.sin(0.3)])
+
+
+def test_the_handles_move_and_turn_the_body_of_their_env_when_the_drag_ends(panels: Panels) -> None:
+    hands = Hands(panels)
+    there = np.array([0.4, 0.2, 0.1, *TURNED])
+    in_view = there + [*OFFSET, 0, 0, 0, 0]
+    panels.turn("/hands/gizmo", np.array([*(hands.pose[:3] + OFFSET), 1, 0, 0, 0]), "start")
+    panels.turn("/hands/gizmo", in_view)
+    drawn = hands.redraw()
+    np.testing.assert_allclose(drawn[1, hands.geometry.body_names.index("cube")], there, atol=1e-6)
+    assert (drawn != hands.poses).any(axis=2).sum() == 1 and not hands.session.asked
+    panels.turn("/hands/gizmo", in_view, "end")
+    (moved,) = hands.session.asked
+    assert moved == BodyMoved("cube", (1,), tuple(pytest.approx(one, abs=1e-6) for one in there))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(hands.redraw(), hands.poses)
+
+
+def test_the_grip_and_the_handles_are_at_the_body_of_the_selected_env(panels: Panels) -> None:
+    hands = Hands(panels, "table", kind="dynamic")
+    hands.poses[1, hands.geometry.body_names.index("table")] = [
+        0.1,
+        0.2,
+        0.3,
+        np.sqrt(0.5),
+        np.sqrt(0.5),
+        0,
+        0,
+    ]
+    hands.redraw()
+    (grip,), (gizmo,) = panels.nodes("/hands/grip"), panels.nodes("/hands/gizmo")
+    # The table's middle is 0.46 m below its origin; turned about x, that is along y.
+    np.testing.assert_allclose(grip.position, np.array([0.1, 0.66, 0.3]) + OFFSET, atol=1e-6)
+    np.testing.assert_allclose(grip.dimensions, 1.02 * np.array([1.2, 2.4, 0.92]), atol=1e-5)
+    np.testing.assert_allclose(gizmo.position, np.array([0.1, 0.2, 0.3]) + OFFSET, atol=1e-6)
+    for node in (grip, gizmo):
+        np.testing.assert_allclose(node.wxyz, [np.sqrt(0.5), np.sqrt(0.5), 0, 0], atol=1e-6)
+
+
+def test_the_force_is_that_of_the_pulled_body(panels: Panels) -> None:
+    hands = Hands(panels, playing=True)
+    hands.drag(hands.pose[:3], np.array([0.0, 0.0, 0.5]))
+    for body, shown in (("cube", "3.25 N"), ("arm/hand", "0 N")):
+        hands.view = replace(hands.view, pulled=Pulled(1, body, 3.25))
+        hands.redraw()
+        assert panels.labels() == [shown]
+    (label,) = panels.nodes("/hands/force")
+    np.testing.assert_allclose(label.position, np.array([0.0, 0.0, 0.5]) + OFFSET, atol=1e-6)
+
+
 def test_another_page_does_not_take_the_body_out_of_the_hand(panels: Panels) -> None:
     hands = Hands(panels)
     hands.drag(hands.pose[:3])
@@ -184,6 +236,27 @@ def test_a_typed_coordinate_moves_the_selected_body_in_one_env_or_in_all(live_pa
     live_page.show(changed(view, hands=State(all_envs=True)))
     live_page.do(SetBodyPosition(of="x", to=0.1))
     assert live_page.asked[-1].env_idx == (0, 1, 2)
+
+
+def test_the_numbers_are_those_of_the_selected_env_and_one_angle_turns_the_body_in_place(
+    live_page: Live,
+) -> None:
+    view = replace(running(3, selected_env=2), playing=False)
+    assert view.step is not None and view.task is not None
+    poses, cube = view.step.poses.copy(), view.task.geometry.body_names.index("cube")
+    poses[2, cube] = [0.1, -0.2, 0.3, *quaternion_from_rpy(10.0, 20.0, 30.0)]
+    live_page.do(SelectBody(body="cube"))
+    live_page.show(replace(view, step=replace(view.step, poses=poses)))
+    inspect = live_page.part("Inspect")
+    assert inspect.typed("Position") == pytest.approx((0.1, -0.2, 0.3))
+    assert inspect.typed("Rotation") == pytest.approx((10, 20, 30), abs=0.01)
+    inspect.type("Rotation", -40.0, at=1)
+    moved = live_page.asked[-1]
+    assert moved.body == "cube" and moved.env_idx == (2,)
+    assert moved.pose[:3] == pytest.approx((0.1, -0.2, 0.3))
+    assert rpy_of(np.array(moved.pose[3:])) == pytest.approx((10, -40, 30), abs=1e-3)
+    live_page.do(WriteBodyPose())
+    assert live_page.asked[-1] == StartWanted(BodyPose("cube", tuple(map(float, poses[2, cube]))))
 
 
 def test_the_handles_are_shown_at_the_body_while_nothing_plays(live_page: Live) -> None:
@@ -235,6 +308,36 @@ def test_a_driver_sees_the_keys_and_the_set_and_ends_episodes_by_buttons(live_pa
     for command in (KeepEpisode(), DiscardEpisode(), BeginAgain()):
         live_page.do(command)
     assert live_page.asked[-3:] == [KeepEpisode(), DiscardEpisode(), BeginAgain()]
+
+
+def test_the_sign_names_the_env_that_is_driven_and_what_the_gamepads_buttons_do(live_page: Live) -> None:
+    live_page.show(replace(running(3, selected_env=2), features={State: State(driving=True)}))
+    sign = live_page.html("data-drive")
+    assert re.search(r"\benv 2\b", words_of(sign).lower())
+    for button, command in ((1, "begin_again"), (2, "discard_episode"), (3, "keep_episode")):
+        assert f'"{button}": "{command}"' in unescape(sign)
+    live_page.show(replace(running(3, selected_env=2), features={State: State()}))
+    assert not live_page.html("data-drive")
+
+
+def test_driving_and_reaching_are_offered_to_robots_that_can(live_page: Live) -> None:
+    view, run = running(2), live_page.part("Run")
+    assert view.task is not None
+    arms = (ArmDescription("arm/hand", ("a",)),)
+    for actions, arms_of, drives, reaches in (
+        (view.task.actions, arms, True, True),
+        (view.task.actions, (), True, False),
+        ((), (), False, False),
+    ):
+        live_page.show(
+            replace(
+                view,
+                task=replace(view.task, actions=actions, arms=arms_of),
+                task_serial=len(actions) + 9 * len(arms_of),
+            )
+        )
+        offered = [run.button(name).command is not None for name in ("Drive by keys", "Reach")]
+        assert offered == [drives, reaches]
 
 
 @pytest.mark.parametrize("count", [7, 9])

@@ -15,7 +15,14 @@ from tests.drive.panels import Panels
 from tests.drive.scenes import running
 from tests.drive.session import fake_worker_session, live_session, wait_until
 from workbench.hands.commands import ResetUntil, StopResetUntil
-from workbench.hands.reset_until import BeginSearch, EndSearch, ResetSearch, ResetTried
+from workbench.hands.reset_until import (
+    MAX_RESETS,
+    BeginSearch,
+    EndSearch,
+    ResetSearch,
+    ResetTried,
+    SearchFailed,
+)
 from workbench.hands.reset_until_panel import ResetUntilPanel
 from workbench.live.commands import ChoosePauseEntry, ChoosePauseTest, PlayRun, SetPauseLevel, SetSeed
 from workbench.live.messages import Play, Reset
@@ -102,6 +109,38 @@ def test_a_search_is_bounded_stops_and_goes_on_where_it_stopped(tmp_path: Path, 
         fake.session.do(ResetUntil())
         fake.load("patched")
         assert fake.view.of(ResetSearch).state == "stopped", "the code has changed"
+
+
+def test_another_condition_begins_at_the_present_seed_and_a_failure_is_told(
+    tmp_path: Path, begun: list[Any]
+) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.load()
+        fake.session.do(ChoosePauseEntry(entry="success"))
+        fake.session.do(ResetUntil())
+        assert len(begun[-1].seeds) == MAX_RESETS and fake.view.of(ResetSearch).total == 3 * MAX_RESETS
+        fake.session.happen(ResetTried(30, 3, ()))
+        fake.session.do(StopResetUntil())
+        fake.session.do(ChoosePauseTest(test="becomes false"))
+        fake.session.do(ResetUntil())
+        assert begun[-1].seeds[0] == 3 and fake.view.of(ResetSearch).tried == 0
+        fake.session.happen(SearchFailed("the task raised", None))
+        failed = fake.view.of(ResetSearch)
+        assert (failed.state, failed.why) == ("failed", "the task raised")
+        fake.session.happen(ResetTried(33, 3, (0,)))
+        assert fake.view.of(ResetSearch) == failed
+        fake.load("patched")
+        assert fake.view.of(ResetSearch) == ResetSearch()
+
+
+def test_the_result_of_another_condition_is_not_shown(panels: Panels) -> None:
+    panel, found = (
+        ResetUntilPanel(panels.server, 1.0),
+        ResetSearch("found", PauseWhen("success"), 8, 40, 6, 1),
+    )
+    for when, shown in ((PauseWhen("success"), True), (PauseWhen("near"), False)):
+        panel.draw(replace(running(2), pause_when=when, features={ResetSearch: found}))
+        assert ("Seed 6, env 1" in panels.html("reset_until")) == shown
 
 
 def test_no_condition_and_a_reward_are_refused(tmp_path: Path, begun: list[Any]) -> None:

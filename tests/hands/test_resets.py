@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from workbench.envs.inspection import Overlap
 from workbench.hands.commands import HideResets, SampleResets, ShowReset, ToggleGhosts
 from workbench.hands.panel import HandsPanel
 from workbench.hands.questions import FirstStates
-from workbench.hands.resets import MIN_EPISODES, ResetCloud, ResetSampled
-from workbench.hands.resets_panel import ResetsPanel
+from workbench.hands.resets import MIN_EPISODES, ResetCloud, ResetSampled, SamplingFailed
+from workbench.hands.resets_panel import BINS, ResetsPanel, histograms, marks, trouble_rows
+from workbench.live.commands import SetSeed
 from workbench.live.messages import Reset
 from workbench.page.command import Refused
 
@@ -190,3 +192,71 @@ def test_the_shapes_are_as_many_as_the_resets_that_have_the_body(
     panel.do(ToggleGhosts(), None)  # type: ignore[arg-type]
     panel.draw_in_view(session.shown)
     assert not panels.nodes("/hands/ghosts/0")
+
+
+def test_what_the_resets_of_each_body_came_to_is_told_by_pairs_envs_and_bins() -> None:
+    geometry = running(2).task.geometry
+    cube, table = (geometry.body_names.index(name) for name in ("cube", "table"))
+    poses = np.zeros((4, 2, len(geometry.body_names), 7), np.float32)
+    poses[..., 3] = 1.0
+    poses[..., cube, 0] = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    poses[3, 1, cube] = np.nan
+    pairs = [
+        ((), ()),
+        (("cube", "table"), ()),
+        ((("hand", "cube")), ("table", "cube")),
+        ((), ("hand", "table")),
+    ]
+    states = tuple(
+        FirstStates(
+            poses[batch],
+            tuple((Overlap(pair, 0.001 * (1 + batch)),) if pair else () for pair in of),  # type: ignore[arg-type]
+            (cube, table),
+            np.array([[batch == 3, False], [False, batch == 0]]),
+        )
+        for batch, of in enumerate(pairs)
+    )
+    cloud = ResetCloud("done", 1, (5, 7, 9, 11), states, 4)
+    found = cloud.overlaps("cube")
+    assert list(found) == ["table", "hand"], "the most frequent one first"
+    np.testing.assert_allclose(found["table"], [[0, 0], [0.002, 0], [0, 0.003], [0, 0]])
+    np.testing.assert_allclose(found["hand"], [[0, 0], [0, 0], [0.003, 0], [0, 0]])
+    np.testing.assert_array_equal(cloud.out_of_reach(cube), [[0, 0], [0, 0], [0, 0], [1, 0]])
+    np.testing.assert_array_equal(cloud.out_of_reach(table), [[0, 1], [0, 0], [0, 0], [0, 0]])
+    assert marks(cloud, cube, "cube").tolist() == [[0, 0], [1, 0], [1, 1], [2, 0]]
+    x = histograms(cloud, cube, "cube")[0]
+    assert (x.low, x.high) == ("0.000 m", "1.000 m") and len(x.bars) == BINS
+    assert [bar for bar in x.bars if any(bar)] == [(60, 40, 0), (0, 20, 20)], "in per cent of the fullest bin"
+    assert x.bars[0] == (60, 40, 0) and x.bars[-1] == (0, 20, 20)
+    rows = trouble_rows(cloud, cube, "cube")
+    assert [(row.count, [show for _, show in row.resets]) for row in rows] == [
+        ("2 of 7", [ShowReset(seed=7, env=0), ShowReset(seed=9, env=1)]),
+        ("1 of 7", [ShowReset(seed=9, env=0)]),
+        ("1 of 7", [ShowReset(seed=11, env=0)]),
+    ]
+
+
+def test_sampling_ends_after_its_batches_or_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Any] = []
+    monkeypatch.setattr("workbench.hands.resets.ResetJobs.perform", lambda _, effect: begun.append(effect))
+    with fake_worker_session(tmp_path) as fake:
+        fake.load()
+        fake.session.do(SetSeed(seed=100))
+        for _ in range(2):
+            fake.session.do(SampleResets())
+            seeds = begun[-1].seeds
+            assert seeds == tuple(range(100, 100 + 3 * len(seeds), 3)) and 3 * (
+                len(seeds) - 1
+            ) < MIN_EPISODES <= 3 * len(seeds)
+            serials = []
+            for seed in seeds:
+                assert fake.view.of(ResetCloud).state == "running"
+                fake.session.happen(ResetSampled(seed, FirstStates(fake.view.step.poses)))
+                serials.append(fake.view.of(ResetCloud).serial)
+            cloud = fake.view.of(ResetCloud)
+            assert cloud.state == "done" and cloud.seeds == seeds and len(set(serials)) == len(seeds)
+        fake.session.do(SampleResets())
+        fake.session.happen(SamplingFailed("it raised", None))
+        assert (fake.view.of(ResetCloud).state, fake.view.of(ResetCloud).why) == ("failed", "it raised")
