@@ -6,18 +6,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
+import sapien
 import sapien.physx as physx
 import torch
 
 from tests.drive.envs import PICK_CUBE, batched
+from tests.envs.by_hand import BOX, box, by_hand
+from tests.envs.stock_env import Bare
 from workbench.envs import action_vector as actions
 from workbench.envs import maniskill_private
-from workbench.envs.inspect_env import inspect_env
+from workbench.envs.inspect_env import MAX_VALUES, inspect_env, list_contacts
 from workbench.envs.inspection import SECTIONS
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.simulation.cpu_system import batched_system
@@ -181,3 +185,105 @@ def test_a_section_whose_hook_raises_leaves_the_others() -> None:
     read = inspect_env(task, 0, SECTIONS)
     assert read.state is None and dict(read.refused) == {"state": "reading it raised KeyError: 'goal'"}
     assert read.joints and read.observation
+
+
+class Various(Bare):
+    """Envs that differ: masses, a box in env 1 only, and entries of the state and the observation. A third box hovers."""
+
+    def _load_scene(self, options: dict) -> None:
+        box(self, "floor", [3, 3, 0.1], sapien.Pose([0, 0, -0.1]), "static")
+        self.light = box(self, "light", pose=sapien.Pose([1, 0, 0.0499]))
+        self.heavy = box(self, "heavy", pose=sapien.Pose([0, 0, 0.0499]))
+        for number, body in enumerate(self.heavy._bodies):
+            body.mass = 5.0 + number
+        # Nearer than the contact offsets: PhysX lists the pair.
+        self.hovers = box(self, "hovers", pose=sapien.Pose([0, 1, 0.055]))
+        self.hovers.set_disable_gravity(True)
+        builder = self.scene.create_actor_builder()
+        for z, friction in ((0.0, 0.1), (0.2, 0.4)):
+            material = physx.PhysxMaterial(friction, friction + 0.1, friction + 0.2)
+            builder.add_box_collision(sapien.Pose([0, 0, z]), half_size=BOX, material=material)
+        builder.initial_pose = sapien.Pose([2, 0, 30])
+        builder.set_scene_idxs([1])
+        self.rare = builder.build("rare")
+        self.chain = by_hand(self, 2)
+        self.chain.active_joints[1].set_drive_properties(50, 5)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.chain.set_qpos(torch.stack([0.1 * env_idx, -0.1 * env_idx], dim=1))
+
+    def get_state_dict(self) -> Any:
+        memory = {"best": torch.arange(3.0) + 1, "limit": torch.tensor(7), "counts": torch.arange(5)}
+        return {**super().get_state_dict(), "memory": memory}
+
+    def _get_obs_extra(self, info: dict) -> dict:
+        number = torch.arange(3.0)[:, None]
+        return {"number": torch.cat([number, -number], dim=1), "many": torch.zeros(3, 10, 10)}
+
+
+@pytest.fixture(scope="module")
+def various() -> Iterator[TaskEnv]:
+    task = TaskEnv(batched(Various, 3, obs_mode="state_dict"))
+    task.reset(seed=0)
+    for _ in range(20):
+        task.step(None)
+    task.reset(env_idx=[2])
+    task.step(None)
+    yield task
+    task.close()
+
+
+@pytest.mark.parametrize("env", range(3))
+def test_each_section_is_that_of_the_env(various: TaskEnv, env: int) -> None:
+    read = inspect_env(various, env, SECTIONS, "heavy")
+    own: Any = various.env
+    assert (read.env, read.elapsed_steps, read.refused) == (env, (21, 21, 1)[env], ())
+    state = by_name(read.state)
+    assert state["memory/best"] == env + 1 and state["memory/limit"] == 7
+    assert np.isnan(state["memory/counts"]), "five numbers are no rows of three envs"
+    assert {name for name in state if "rare" in name} == (
+        {f"actors/rare/{part}" for part in "pqvw"} if env == 1 else set()
+    )
+    whole = own.heavy.get_state()[env], own.chain.get_state()[env]
+    for struct, row in zip(("actors/heavy/", "articulations/chain/"), whole, strict=True):
+        parts = [values for name, values in state.items() if name.startswith(struct)]
+        assert np.concatenate(parts).tolist() == row.tolist()
+    observed = {leaf.name: leaf for leaf in read.observation}
+    number = observed["extra/number"]
+    assert number.values.tolist() == [env, -env] and (number.low, number.high) == (-env, env)
+    assert observed["extra/many"].shape == (10, 10) and len(observed["extra/many"].values) == MAX_VALUES
+    [joints] = read.joints
+    chain = own.chain._objs[env]
+    np.testing.assert_array_equal(joints.position, chain.qpos)
+    np.testing.assert_array_equal(joints.velocity, chain.qvel)
+    np.testing.assert_allclose(np.stack([joints.low, joints.high]), [[-2, -2], [2, 2]])
+    assert np.isnan(joints.target).tolist() == [True, False], "only one joint has a drive"
+    assert joints.names == ("hinge0", "hinge1") and set(joints.kinds) == {"revolute"}
+    body = own.heavy._bodies[env]
+    assert read.body.mass == pytest.approx(5 + env) and read.body.has_gravity
+    np.testing.assert_array_equal(read.body.velocity, body.linear_velocity)
+    np.testing.assert_allclose(read.body.centre_of_mass, [0, 0, 0], atol=1e-6)
+    rare = inspect_env(various, env, [], "rare").body
+    assert (rare is None) == (env != 1)
+    if rare is not None:
+        assert [material[0] for material in rare.materials] == pytest.approx([0.1, 0.4])
+        np.testing.assert_allclose(rare.centre_of_mass, [0, 0, 0.1], atol=1e-6)
+    hovers = inspect_env(various, env, [], "hovers").body
+    assert hovers is not None and not hovers.has_gravity
+
+
+@pytest.mark.parametrize("env", range(2))
+def test_bodies_that_touch_are_listed_by_force_without_those_that_are_only_near(
+    various: TaskEnv, env: int
+) -> None:
+    touching = inspect_env(various, env, ["contacts"]).contacts
+    assert [pair.bodies for pair in touching] == [("floor", "heavy"), ("floor", "light")]
+    assert touching[0].force[2] == pytest.approx(-9.81 * (5 + env), rel=0.05), "on the first, by the second"
+    listed = [contact.bodies for contact in list_contacts(various.env, env)]
+    assert any("hovers" in bodies for bodies in listed), (
+        "the hovering box must be near, or this proves nothing"
+    )
+    for pair in touching:
+        own = [c for c in list_contacts(various.env, env) if set(c.bodies) == set(pair.bodies)]
+        assert pair.separation == min(float(contact.separations.min()) for contact in own)
+        assert sorted(map(tuple, pair.points)) == sorted(tuple(p) for contact in own for p in contact.points)

@@ -16,7 +16,9 @@ from workbench.envs.keywords import (
     Keyword,
     as_json,
     constructor_arguments,
+    control_mode_of,
     describe_keywords,
+    one_mode,
     read_value,
     shown,
 )
@@ -95,6 +97,12 @@ def test_types_defaults_and_values_come_from_the_signature() -> None:
     assert found["way"].choices == ('"left"', '"right"') and found["colour"].choices == ('"red"', '"blue"')
     assert found["colour"].value == '"red"' and found["where"].value == "[0.0, 1.0]"
     assert found["made"].fixed and not found["gone"].fixed
+    assert (found["needed"].default, found["needed"].optional) == ("null", True)
+    given = own(Task, Base(), {"way": "up", "count": 1, "colour": "red"}, {"count": 7, "name": "b"})
+    assert given["way"].choices == ('"left"', '"right"', '"up"'), "what is given may be chosen again"
+    assert (given["count"].value, given["count"].default) == ("1", "7")
+    assert (given["name"].value, given["name"].default) == ('"b"', '"b"')
+    assert "robot_uids" not in given and "num_envs" not in given
 
 
 def test_a_constructor_without_kwargs_hides_those_of_its_bases() -> None:
@@ -113,6 +121,45 @@ def test_modes_offer_what_the_class_supports_and_the_current_one() -> None:
     assert '"rgb+depth"' in modes["obs_mode"].choices and modes["obs_mode"].choices[-1] == '"rgb+normal"'
     assert '"any_textures"' not in modes["obs_mode"].choices
     assert modes["reward_mode"].value == '"dense"'
+
+
+def test_several_robots_are_named_and_have_no_common_control_mode() -> None:
+    env = Base()
+    env.agent = SimpleNamespace(agents=[SimpleNamespace(uid="left"), SimpleNamespace(uid="right")])
+    made = describe_keywords(Task, env, {}, {}, Base)
+    assert made.robot == "left, right" and "control_mode" not in {one.name for one in made.modes}
+    env.agent = None
+    assert describe_keywords(Task, env, {}, {}, Base).robot == "" and control_mode_of(env) is None
+
+
+@pytest.mark.parametrize(
+    ("mode", "shared"),
+    [
+        ("a", "a"),
+        ({"left": "a", "right": "a"}, "a"),
+        ({"left": "a", "right": "b"}, None),
+        ({}, None),
+        (None, None),
+        (3, None),
+    ],
+)
+def test_the_control_mode_of_robots_is_one_that_all_have(mode: object, shared: str | None) -> None:
+    assert one_mode(mode) == shared
+
+
+@pytest.mark.parametrize(
+    ("text", "shows"),
+    [
+        ('"panda"', "panda"),
+        ('["panda", "fetch"]', "panda, fetch"),
+        ("[1, 2]", "[1, 2]"),
+        ("[]", "[]"),
+        ("0.5", "0.5"),
+        ("no JSON", "no JSON"),
+    ],
+)
+def test_a_value_is_shown_as_a_person_writes_it(text: str, shows: str) -> None:
+    assert shown(text) == shows
 
 
 def test_a_robot_given_as_a_class_is_shown_by_its_uid_or_name() -> None:
@@ -140,6 +187,8 @@ def test_json_values_become_the_types_that_the_class_takes() -> None:
     [
         (Keyword("a", "int", "1"), " 7 ", 7),
         (Keyword("a", "float", "1"), "1e-5", 1e-5),
+        (Keyword("a", "float", "1"), "2", 2.0),
+        (Keyword("a", "int", "1", optional=True), "", None),
         (Keyword("a", "bool", "true"), "false", False),
         (Keyword("a", "str", '"x"'), "true", "true"),
         (Keyword("a", "str", '"x"', optional=True), "null", None),
@@ -157,7 +206,8 @@ def test_typed_text_is_parsed(keyword: Keyword, text: str, value: object) -> Non
     [
         (Keyword("size", "int", "1"), "1.5"),
         (Keyword("size", "int", "1"), "true"),
-        (Keyword("size", "int", "1"), str(10**30)),
+        (Keyword("size", "int", "1"), str(2**63)),
+        (Keyword("size", "int", "1"), "null"),
         (Keyword("size", "float", "1"), "NaN"),
         (Keyword("size", "float", "1"), "1e999"),
         (Keyword("size", "bool", "true"), "1"),

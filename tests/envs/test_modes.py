@@ -210,6 +210,21 @@ def test_control_in_the_hands_frame(control_mode: str, monkeypatch: pytest.Monke
     follow_under_control(control_mode)
 
 
+def interpolating_configs(panda: Any) -> dict[str, Any]:
+    """Modes whose controllers set a target before each substep."""
+    configs = PANDA_CONFIGS(panda)
+    for mode in ("pd_ee_delta_pos", "pd_joint_delta_pos"):
+        configs[mode]["arm"].interpolate = True
+    return configs
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+@pytest.mark.parametrize("control_mode", ["pd_ee_delta_pos", "pd_joint_delta_pos"])
+def test_control_with_targets_between_substeps(control_mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Panda, "_controller_configs", property(interpolating_configs))
+    follow_under_control(control_mode)
+
+
 def follow_under_control(control_mode: str) -> None:
     batch, stock = pair(control_mode=control_mode, **NO_PICTURES)
     assert batch.single_action_space == stock.single_action_space

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.drive.scenes import step_of, table_scene
-from workbench.envs.outliers import OutlierKind, OutlierWatch, lowest_still_point
+from workbench.envs.outliers import Outlier, OutlierKind, OutlierWatch, lowest_still_point
 
 
 def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np.ndarray]:
@@ -51,8 +51,12 @@ def test_the_worst_body_is_named_with_its_value() -> None:
     moved = poses.copy()
     moved[1, 2, 1] += 1.5
     moved[1, 3, 0] -= 2.0
+    moved[0, :2, 0] += 9.0  # the ground and a kinematic body are no outliers
     [sight] = watch.check(step_of(moved))
     assert (sight.kind, sight.reason(1)) == (OutlierKind.FAST, "cube moved at 40 m/s")
+    assert sight.body is not None and sight.body(1) == "cube"
+    told = Outlier(sight.kind, 3, sight.reason(1)).text
+    assert told.startswith(str(sight.kind.rule)) and told.endswith(sight.reason(1))
     watch, poses = watched(2)
     high = lowered(poses, -3.0, [0, 1])
     watch.begin(np.ones(2, bool), step_of(high))
@@ -134,3 +138,29 @@ def test_the_lowest_still_point_is_the_ground_for_any_mesh_orientation() -> None
     assert lowest_still_point(geometry, poses) == pytest.approx(0.5 + 0.9195)
     loose = replace(geometry, body_kinds=("kinematic",) * 4)
     assert lowest_still_point(loose, poses) == -np.inf
+
+
+def test_a_link_flies_off_a_body_without_a_shape_does_not_and_another_scene_is_left_out() -> None:
+    geometry, poses = table_scene(2)
+    moved = poses.copy()
+    moved[1, 2:, 0] += 2.0
+    bare = replace(geometry, visuals=tuple(v for v in geometry.visuals if not v.name.startswith("cube")))
+    watch = OutlierWatch(bare, step_of(poses), 0.05, "dense")
+    [sight] = watch.check(step_of(moved))
+    assert sight.reason(1).startswith("arm/hand moved at 40") and sight.envs.tolist() == [False, True]
+    fewer = step_of(poses[:, :3] + 100)
+    watch.begin(np.array([True, True]), fewer)
+    assert watch.check(fewer) == [], "a reset may rebuild the scene with other bodies"
+    assert [s.kind for s in watch.check(step_of(poses))] == [OutlierKind.FAST], "the last known step stays"
+
+
+def test_a_term_of_the_reward_breaks_the_rule_of_rewards() -> None:
+    watch, poses = watched(2)
+    entries = {"reward_terms/reach": np.array([0.0, np.nan]), "height": np.array([0.0, np.nan])}
+    sights = {sight.kind: sight for sight in watch.check(step_of(poses, **entries))}
+    assert sights.keys() == {OutlierKind.TERM_NOT_FINITE, OutlierKind.ENTRY_NOT_FINITE}
+    assert "reach" in sights[OutlierKind.TERM_NOT_FINITE].reason(1)
+    assert OutlierKind.TERM_NOT_FINITE.rule == OutlierKind.REWARD_NOT_FINITE.rule
+    assert OutlierKind.ENTRY_NOT_FINITE.rule != OutlierKind.TERM_NOT_FINITE.rule
+    nothing = Outlier(OutlierKind.ACTION_NOT_FINITE, 0, "the action is NaN")
+    assert nothing.text == nothing.reason, "actions break no rule of the task"

@@ -22,9 +22,11 @@ from tests.drive.render_device import RENDER_DEVICE
 from tests.envs.stock_env import Bare
 from workbench.envs import action_vector as actions
 from workbench.envs import backends
-from workbench.envs.backends import choose_backend
+from workbench.envs.backends import BackendUnavailable, choose_backend
+from workbench.envs.error_notes import WrongAction
+from workbench.envs.maniskill_private import last_observation
 from workbench.envs.scene.scene_index import scene_index
-from workbench.envs.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
+from workbench.envs.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env, to_numpy
 
 pytestmark = pytest.mark.thorough
 
@@ -98,6 +100,81 @@ def test_each_env_gets_its_own_seed_in_any_order_of_envs(push: TaskEnv) -> None:
     # Joint noise comes from numpy's generator, which ManiSkill shares across the batch.
     assert torch.equal(push.env.agent.robot.qpos[0], single.agent.robot.qpos[0])
     single.close()
+
+
+def test_a_state_that_is_put_back_is_observed(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    kept, first = push.snapshot(), push.obs.clone()
+    push.step(np.ones((N, 8), np.float32))
+    moved = push.obs.clone()
+    push.restore(kept, [1, 3])
+    same = torch.isclose(push.obs, first, atol=1e-4).all(dim=1)
+    assert same.tolist() == [False, True, False, True]
+    assert torch.equal(push.obs[[0, 2]], moved[[0, 2]])
+    assert torch.equal(last_observation(push.env), push.obs)
+
+
+def test_what_the_task_returned_is_checked_after_each_reset_step_and_rescore(push: TaskEnv) -> None:
+    checked: list[Any] = []
+    task = TaskEnv(push.env, 50, lambda info, reward: checked.append((set(info), reward)))
+    action = np.zeros((N, 8), np.float32)
+    task.reset(seed=0)
+    task.reset(env_idx=[2])
+    task.step(action)
+    task.rescore()
+    task.rescore(action)
+    assert [reward is None for _, reward in checked] == [True, True, False, True, False]
+    assert all("success" in info and "reconfigure" not in info for info, _ in checked)
+
+    def refuse(info: Any, reward: Any) -> None:
+        raise ZeroDivisionError
+
+    refusing = TaskEnv(push.env, 50, refuse)
+    for call in (lambda: refusing.reset(seed=0), lambda: refusing.step(action), refusing.rescore):
+        with pytest.raises(ZeroDivisionError):
+            call()
+
+
+def test_a_result_is_a_copy_of_what_the_caller_and_the_task_keep(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    action, entry, reward = np.zeros((N, 8), np.float32), torch.zeros(N), torch.zeros(N)
+    result = push.result({"entry": entry, "success": entry > 0}, reward, action)
+    for kept in (action, entry, reward, push.env.elapsed_steps):
+        kept += 1
+    assert not (result.action.any() or result.evaluate["entry"].any() or result.reward.any())
+    assert result.elapsed_steps.tolist() == [0] * N
+    assert to_numpy(entry) is not entry and not np.shares_memory(to_numpy(entry), entry.numpy())
+
+
+@pytest.mark.parametrize("seeds", [[1], [1, 2, 3, 4, 5], []])
+def test_a_wrong_number_of_seeds_is_refused(push: TaskEnv, seeds: list[int]) -> None:
+    push.reset(seed=[7, 8, 9, 10])
+    for chosen in (None, [0, 2]):
+        with pytest.raises(ValueError):
+            push.reset(seed=seeds, env_idx=chosen)
+    assert push.episode_seeds.tolist() == [7, 8, 9, 10]
+    push.reset(seed=20)
+    push.reset(seed=30, env_idx=[3, 1])
+    assert push.episode_seeds.tolist() == [20, 31, 22, 30], "the i-th env gets seed + i"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"num_envs": 0},
+        {"num_envs": -1},
+        {"backend": "cuda"},
+        {"pictures": "quick"},
+        {"rules": "loud"},
+        {"threads": 0},
+        {"threads": -2},
+    ],
+    ids=str,
+)
+def test_wrong_options_are_refused_before_an_env_is_made(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        EnvOptions(**wrong)
+    EnvOptions(1, threads=1)
 
 
 class DrawsInEvaluate(PUSH_CUBE):
@@ -219,15 +296,99 @@ def test_the_action_of_two_robots_is_one_flat_vector_and_back() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("given", [np.zeros(8), np.zeros((N, 8)), torch.zeros(N, 8)])
-def test_a_policys_action_may_be_one_for_all_or_one_each(push: TaskEnv, given: object) -> None:
-    assert actions.to_flat_action(push.env, push.parts, given).shape == (N, 8)
+@pytest.mark.parametrize("convert", [np.asarray, torch.from_numpy, np.ndarray.tolist])
+def test_a_policys_action_may_be_one_for_all_or_one_each(push: TaskEnv, convert: Any) -> None:
+    each = np.arange(8 * N, dtype=np.float32).reshape(N, 8) / 100
+    taken = actions.to_flat_action(push.env, push.parts, convert(each.copy()))
+    np.testing.assert_array_equal(taken, each)
+    np.testing.assert_array_equal(
+        actions.to_flat_action(push.env, push.parts, convert(each[1].copy())), np.tile(each[1], (N, 1))
+    )
+    assert not np.shares_memory(actions.to_flat_action(push.env, push.parts, each), each)
+    huge = np.full((N, 8), 3e38, np.float32)
+    assert (actions.to_flat_action(push.env, push.parts, huge) == huge).all(), "finite, though the sum is not"
+
+
+def test_the_first_number_of_an_action_that_is_not_finite_is_named(push: TaskEnv) -> None:
+    wrong = np.zeros((N, 8), np.float32)
+    wrong[2, 5], wrong[3, :] = np.inf, np.nan
+    with pytest.raises(WrongAction) as caught:
+        actions.to_flat_action(push.env, push.parts, wrong)
+    name = [name for part in push.parts for name in part.names][5]
+    assert f"2 of {N} envs" in str(caught.value) and f"inf for {name} of env 2" in str(caught.value)
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((N, 7)), np.zeros((2, 8)), np.full((N, 8), np.nan), 3.0])
 def test_a_policys_action_that_does_not_fit_is_refused(push: TaskEnv, wrong: object) -> None:
     with pytest.raises(ValueError):
         actions.to_flat_action(push.env, push.parts, wrong)
+
+
+def test_an_action_for_each_robot_needs_exactly_the_robots_of_the_task(push: TaskEnv) -> None:
+    env = opened("TwoRobotPickCube-v1", 2)
+    given = {
+        name: np.full(8, value) for name, value in zip(("panda_wristcam-0", "panda_wristcam-1"), (0.1, 0.2))
+    }
+    assert set(given) == set(env.env.single_action_space.spaces)
+    flat = actions.to_flat_action(env.env, env.parts, dict(reversed(given.items())))
+    np.testing.assert_allclose(flat, np.tile(np.repeat([0.1, 0.2], 8), (2, 1)), rtol=1e-6)
+    first, second = given
+    assert [name.partition("/")[0] for part in env.parts for name in part.names] == [first] * 8 + [second] * 8
+    wrong: list[tuple[Any, str]] = [
+        ({first: np.zeros(8)}, second),
+        ({**given, "third": np.zeros(8)}, "third"),
+        ({**given, second: np.zeros(7)}, second),
+        (np.zeros(8), "16"),
+    ]
+    for action, named in wrong:
+        with pytest.raises(WrongAction) as caught:
+            actions.to_flat_action(env.env, env.parts, action)
+        assert named in str(caught.value)
+    for action in (given, None, "hold", (np.zeros(8), {"state": 1})):
+        with pytest.raises(WrongAction):
+            actions.to_flat_action(push.env, push.parts, action)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("control_mode", "names", "low", "target"),
+    [
+        (
+            "pd_joint_delta_pos",
+            ["arm/panda_joint1", "arm/panda_joint7", "gripper/panda_finger_joint1"],
+            -1,
+            False,
+        ),
+        (
+            "pd_joint_pos",
+            ["arm/panda_joint1", "arm/panda_joint7", "gripper/panda_finger_joint1"],
+            -2.8973,
+            True,
+        ),
+        ("pd_ee_delta_pos", ["arm/x", "arm/z", "gripper/panda_finger_joint1"], -1, False),
+        ("pd_ee_pose", ["arm/x", "arm/rz", "gripper/panda_finger_joint1"], -2, True),
+    ],
+)
+def test_each_number_of_an_action_has_a_name_bounds_and_a_kind(
+    control_mode: str, names: list[str], low: float, target: bool
+) -> None:
+    env = opened("PickCube-v1", 2, control_mode=control_mode)
+    arm, gripper = env.parts
+    assert [arm.names[0], arm.names[-1], *gripper.names] == names
+    lowest, highest = actions.bounds(env.parts)
+    space = env.env.single_action_space
+    assert np.array_equal(lowest, space.low) and np.array_equal(highest, space.high)
+    assert lowest[0] == pytest.approx(low) and actions.width(env.parts) == len(lowest)
+    assert actions.is_target(env.parts).tolist() == [target] * len(arm.names) + [True]
+    assert (actions.zero_holds(arm), actions.zero_holds(gripper)) == (not target, False)
+    drawn = actions.random_action(env.parts, 400, np.random.default_rng(0))
+    bounded = np.isfinite(lowest)
+    below, above = np.where(bounded, lowest, -1), np.where(bounded, highest, 1)
+    np.testing.assert_allclose(drawn.min(axis=0), below, atol=0.05 * (above - below).max())
+    np.testing.assert_allclose(drawn.max(axis=0), above, atol=0.05 * (above - below).max())
+    some = actions.action_of(env.parts, 3, {2: np.arange(len(lowest))})
+    assert not some[:2].any() and some[2].tolist() == [*range(len(lowest))]
+    env.close()
 
 
 # --- making ----------------------------------------------------------------------------------------
@@ -258,6 +419,8 @@ def test_gpu_simulation_is_used_only_on_request(monkeypatch: pytest.MonkeyPatch)
     assert backends.unused_gpu_text("cpu") is backends.unused_gpu_text("gpu") is None
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
     assert backends.unused_gpu_text("auto") is None
+    with pytest.raises(BackendUnavailable, match="there is none"):
+        choose_backend("gpu", render=False)
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,9 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
         flat = _rows(action, count, sum(of_robots.values()), "", of_robots, env.control_mode)
     # Fast test: a finite sum means that all numbers are finite. Otherwise test each number, since the sum of
     # finite numbers may overflow.
-    if not math.isfinite(np.add.reduce(flat, axis=None)) and not (finite := np.isfinite(flat)).all():
+    with np.errstate(over="ignore"):
+        total = np.add.reduce(flat, axis=None)
+    if not math.isfinite(total) and not (finite := np.isfinite(flat)).all():
         row, column = np.argwhere(~finite)[0].tolist()
         name = [name for part in parts for name in part.names][column]
         raise WrongAction(

@@ -10,7 +10,7 @@ import sapien
 import sapien.render
 
 from tests.drive.scenes import box_mesh
-from workbench.envs.rendering.in_view import cut_to_view, is_outside, outside_and_inside, planes_of
+from workbench.envs.rendering.in_view import cut_to_view, fixed_to, is_outside, outside_and_inside, planes_of
 
 
 @pytest.fixture
@@ -44,3 +44,34 @@ def test_triangles_behind_the_camera_are_cut_and_the_rest_keeps_its_normals(came
     assert {tuple(corner) for corner in cut.vertices[cut.faces].reshape(-1, 9).round(4)} <= kept
     assert cut.normals is None or len(cut.normals) == len(cut.vertices)
     assert len(cut_to_view(box_mesh((1, 1, 1), (-3, 0, 0)), planes_of(camera)).faces) == 0
+
+
+def test_links_are_fixed_to_those_that_only_fixed_joints_connect() -> None:
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+    builder = scene.create_articulation_builder()
+    links, groups = {}, ["base", "base", "arm", "arm", "arm", "tip", "base"]
+    for number, (parent, kind) in enumerate(
+        [
+            (None, "fixed"),
+            (0, "fixed"),
+            (1, "revolute"),
+            (2, "fixed"),
+            (3, "fixed"),
+            (4, "revolute"),
+            (1, "fixed"),
+        ]
+    ):
+        link = links[number] = builder.create_link_builder(None if parent is None else links[parent])
+        link.set_name(str(number))
+        link.add_box_collision(half_size=[0.01] * 3)
+        if parent is not None:
+            link.set_joint_name(f"joint{number}")
+            limits = [[-1, 1]] if kind == "revolute" else []
+            link.set_joint_properties(kind, limits, sapien.Pose(), sapien.Pose())
+    robot = builder.build(fix_root_link=True)
+    entities = {int(link.name): link.entity for link in robot.links}  # kept alive: ids are compared
+    for number, entity in entities.items():
+        own = {id(other) for k, other in entities.items() if groups[k] == groups[number]}
+        assert fixed_to(entity) == own, number
+    ball = sapien.Entity()
+    assert fixed_to(ball) == {id(ball)}

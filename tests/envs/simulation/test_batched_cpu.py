@@ -11,13 +11,14 @@ from collections.abc import Iterator
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.envs.stock_env import batch_of
-from tests.envs.written import ThrowsAFreeChain
+from tests.envs.written import ThrowsAFreeChain, Written
 from workbench.envs.cpu_scene import batched_class
 from workbench.envs.gpu_rules import Degree
 
@@ -103,6 +104,66 @@ def test_values_computed_from_a_state_that_is_nan_are_skipped_in_its_env_only(pi
         pick_cubes.scene._gpu_fetch_all()
     pick_cubes.reset(seed=[0, 1, 2, 3])
     assert pick_cubes.get_state().isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+def test_a_reset_repairs_the_bodies_that_are_nan_in_its_envs_and_no_other() -> None:
+    env = batch_of(Written, 4)
+    env.reset(seed=[0, 1, 2, 3])
+    lies = Pose.create_from_pq(torch.tensor([[0.5 + 0.1 * i, 0, 0.05] for i in range(4)]))
+    env.lies.set_pose(lies)
+    env.chain.set_qpos(torch.tensor([[0.1 * i, 0.2] for i in range(4)]))
+    env.apply()
+    for lost in (1, 2):
+        env.falls._objs[lost].set_pose(sapien.Pose([np.nan] * 3))
+    env.scene.px.note_change()
+    env.scene._gpu_fetch_all()
+    for chosen, broken in ([1], [2]), ([1, 2], []):
+        env.reset(options={"env_idx": torch.tensor(chosen)})
+        finite = torch.isfinite(env.falls.pose.p).all(dim=1)
+        assert torch.nonzero(~finite)[:, 0].tolist() == broken
+        torch.testing.assert_close(env.falls.pose.p[1], torch.tensor([0, 0, 0.3]))
+        torch.testing.assert_close(env.lies.pose.p, lies.p)  # its neighbours in the same env stay
+        torch.testing.assert_close(env.chain.qpos[:, 0], 0.1 * torch.arange(4))
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+def test_forces_and_torques_of_the_tensors_push_once_and_only_their_rows() -> None:
+    env = batch_of(Written, 3)
+    env.reset(seed=[0, 1, 2])
+    px, rows = env.scene.px, env.falls._body_data_index
+    reference = batch_of(Written, 3)
+    reference.reset(seed=[0, 1, 2])
+    for each in (env, reference):
+        each.scene.step()
+        each.scene._gpu_fetch_all()
+    still = reference.falls.linear_velocity, reference.falls.angular_velocity
+    mass = float(env.falls.mass[0])
+    px.cuda_rigid_body_force.torch()[rows[1], 0] = 100 * mass
+    px.cuda_rigid_body_torque.torch()[rows[2], 1] = 0.1
+    for name in ("force", "torque"):
+        getattr(px, f"gpu_apply_rigid_dynamic_{name}")()
+        assert not getattr(px, f"cuda_rigid_body_{name}").torch().any()
+    for each in (env, reference):
+        each.scene.step()
+        each.scene._gpu_fetch_all()
+    still = reference.falls.linear_velocity, reference.falls.angular_velocity
+    pushed = env.falls.linear_velocity - still[0], env.falls.angular_velocity - still[1]
+    torch.testing.assert_close(
+        pushed[0], torch.tensor([[0, 0, 0], [100 * px.timestep, 0, 0], [0, 0, 0]]), atol=1e-3, rtol=0.01
+    )
+    assert pushed[1].abs().max(dim=1).values.gt(1e-3).tolist() == [False, False, True]
+    assert pushed[1][2, 1] > 10 * pushed[1][2, [0, 2]].abs().max()
+    px.gpu_apply_rigid_dynamic_force()
+    for each in (env, reference):
+        each.scene.step()
+        each.scene._gpu_fetch_all()
+    torch.testing.assert_close(
+        env.falls.linear_velocity - reference.falls.linear_velocity, pushed[0], atol=1e-4, rtol=0
+    )
+    env.close()
+    reference.close()
 
 
 def test_a_velocity_of_a_kinematic_actor_is_not_passed_to_physx(pick_cubes: BaseEnv) -> None:

@@ -20,8 +20,9 @@ from mani_skill.utils.structs.pose import Pose
 from tests.envs.by_hand import box, by_hand
 from tests.envs.stock_env import Bare, batch_of
 from workbench.envs.inspect_env import inspect_env
-from workbench.envs.scene.scene_index import joint_names, read_joints, read_poses, scene_index
+from workbench.envs.scene.scene_index import joint_names, present_states, read_joints, read_poses, scene_index
 from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.state_columns import read_state_columns
 from workbench.envs.task_env import TaskEnv
 
 pytestmark = [
@@ -173,6 +174,14 @@ def test_bodies_that_some_envs_lack_are_read_only_where_they_exist(env: Any) -> 
     poses, names = read_poses(env), scene_index(env).names
     lacking = np.isnan(poses[:, names.index("chain/link1")]).all(axis=1)
     assert lacking.tolist() == [True, False, True, False]
+    columns = {name.partition("/")[2]: column for name, column in read_state_columns(task).items()}
+    for states in (present_states(env), columns):
+        assert states.keys() == {"actors/thing", "articulations/everywhere", "articulations/chain"}
+        chains, rows = np.asarray(states["articulations/chain"]), env.chain.get_state().numpy()
+        assert np.isnan(chains).all(axis=1).tolist() == [True, False, True, False]
+        np.testing.assert_array_equal(chains[[1, 3]], rows)
+        for name, struct in (("actors/thing", env.thing), ("articulations/everywhere", env.everywhere)):
+            np.testing.assert_array_equal(np.asarray(states[name]), struct.get_state().numpy())
     for _ in range(2):  # static poses are read again after the task has moved them
         walls = read_poses(env)[:, names.index("wall"), 0]
         assert len(set(walls.tolist())) == N and np.allclose(walls, [e.pose.p[0] for e in env.wall._objs])

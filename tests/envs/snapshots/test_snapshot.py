@@ -13,6 +13,7 @@ from typing import Any
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
+import sapien
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -21,6 +22,8 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
+from tests.envs.by_hand import box, by_hand
+from tests.envs.stock_env import Bare, single
 from workbench.envs.snapshots.cpu_state import CpuState
 from workbench.envs.snapshots.snapshot import (
     begin_anew,
@@ -451,6 +454,9 @@ def test_an_edited_task_gets_states_by_name_and_reports_the_rest(pick: BaseEnv) 
         ([7], 0, IndexError, "out of range for 6 envs"),
         ([1, 1], 0, ValueError, "twice"),
         ([], 0, ValueError, "empty"),
+        (None, 0, ValueError, "env_idx"),
+        ([0, 1], [0, 1, 2], ValueError, "3 sources for 2 envs"),
+        ([0, 1], [5, 9], IndexError, r"no state of \[9\]"),
     ],
 )
 def test_an_invalid_list_of_envs_is_refused(
@@ -461,6 +467,61 @@ def test_an_invalid_list_of_envs_is_refused(
     with pytest.raises(error, match=words):
         restore_snapshot(pick, snapshot, env_idx, source)
     assert packs(pick) == before
+
+
+def test_a_snapshot_that_does_not_fit_is_refused(pick: BaseEnv) -> None:
+    snapshot = take_snapshot(pick)
+    small, stock = batched(PICK_CUBE, 2), single(PICK_CUBE)
+    before = packs(small)
+    with pytest.raises(IndexError, match="source"):
+        restore_snapshot(small, snapshot)
+    with pytest.raises(TypeError, match="Snapshot"):
+        restore_snapshot(small, "a snapshot")
+    gpu = snapshot._replace(simulation=read_gpu_state(pick, list(range(N))))
+    with pytest.raises(TypeError, match="GPU"):
+        restore_snapshot(pick, gpu)
+    stock.reset(seed=0)
+    with pytest.raises(NotImplementedError):
+        take_snapshot(stock)
+    assert packs(small) == before
+    small.close()
+    stock.close()
+
+
+class Hinged(Bare):
+    """A chain of `hinges` hinges, and a box of the same name as that of the other version."""
+
+    hinges = 1
+
+    def _load_scene(self, options: dict) -> None:
+        self.chain = by_hand(self, self.hinges)
+        self.box = box(self, "box", pose=sapien.Pose([1, 0, 1]))
+
+
+class TwiceHinged(Hinged):
+    hinges = 2
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+@pytest.mark.parametrize(("taken", "into"), [(Hinged, TwiceHinged), (TwiceHinged, Hinged)])
+def test_an_articulation_with_other_joints_is_left_and_reported(taken: Any, into: Any) -> None:
+    old, new = batched(taken, 2), batched(into, 2)
+    for env, angle in ((old, 0.1), (new, 0.7)):
+        env.reset(seed=0)
+        env.chain.set_qpos(torch.full((2, env.hinges), angle))
+        env.box.set_pose(Pose.create_from_pq(torch.tensor([[angle, 0, 1], [2 * angle, 0, 1]])))
+    assert read_gpu_state(old, [0]).states.keys() == read_gpu_state(new, [0]).states.keys()
+    for report in (
+        restore_snapshot(new, take_snapshot(old), [1, 0], source=[0, 1]),
+        write_gpu_state(new, [1, 0], read_gpu_state(old, [0, 1]), [0, 1]),
+    ):
+        carried, missed = report if isinstance(report, tuple) else (report.carried, report.not_carried)
+        assert "actor box" in carried and "articulation chain" not in carried
+        assert [*missed] == ["articulation chain"]
+        torch.testing.assert_close(new.chain.get_qpos(), torch.full((2, new.hinges), 0.7))
+        torch.testing.assert_close(new.box.pose.p[:, 0], torch.tensor([0.2, 0.1]))
+    old.close()
+    new.close()
 
 
 def test_gpu_states_are_read_and_written_through_tensors(pick: BaseEnv) -> None:

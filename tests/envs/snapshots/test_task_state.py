@@ -7,7 +7,7 @@ from __future__ import annotations
 import collections
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
@@ -259,3 +259,79 @@ def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: A
     assert report.not_carried["notes.visits"] == "the task no longer has an attribute of this name"
     assert report.not_carried["velocity_bonus"].startswith("it is not in the snapshot")
     edited.close()
+
+
+class Late(PUSH_CUBE):
+    """Attributes with a default on the class, which the first `evaluate` with `sets` gives a value."""
+
+    best: Any = None
+    words: Any = None
+    limit: Any = None
+    sets = False
+
+    def evaluate(self) -> dict:
+        if self.sets:
+            self.best = torch.arange(self.num_envs) + 1.0
+            self.words = [f"env {i}" for i in range(self.num_envs)]
+            self.limit = torch.tensor([4.0, 5.0])
+        return super().evaluate()
+
+
+def test_attributes_that_an_env_has_not_set_yet_are_restored_with_all_envs_only() -> None:
+    old, new = batched(Late, N), batched(Late, N)
+    old.sets = True
+    old.reset(seed=[0, 1, 2, 3])
+    snapshot = take_snapshot(old)
+    report = restore_snapshot(new, snapshot, [0, 1])
+    assert new.best is new.words is new.limit is None
+    assert {"best", "words", "limit"} <= report.not_carried.keys()
+    report = restore_snapshot(new, snapshot, [3, 2, 1, 0], source=[0, 1, 2, 3])
+    assert {"best", "words", "limit"} <= set(report.carried) and not report.not_carried
+    assert new.best.tolist() == [4, 3, 2, 1] and new.words == ["env 3", "env 2", "env 1", "env 0"]
+    assert new.limit.tolist() == [4, 5] and new.limit is not old.limit
+    old.close()
+    new.close()
+
+
+class Point(NamedTuple):
+    x: torch.Tensor
+    label: str
+
+
+def test_what_cannot_be_kept_is_named_and_the_rest_is_kept(env: Any) -> None:
+    deep: Any = {"here": torch.zeros(N)}
+    for _ in range(10):
+        deep = {"in": deep}
+    env.deep, env.odd = deep, np.array([object()] * N)
+    env.data, env.data_each = torch.zeros(1 << 17), torch.zeros(N, 1 << 17)
+    env.point = Point(torch.arange(N) + 1.0, "a")
+    env.view = env.scene.px.cuda_rigid_body_data.torch()[:N]
+    try:
+        snapshot = take_snapshot(env)
+        named = {*snapshot.omitted} - {"recent"}
+        assert {name.partition("[")[0] for name in named} == {"deep", "odd", "data"}
+        env.point = Point(torch.zeros(N), "b")
+        env.data_each += 1
+        report = restore_snapshot(env, snapshot, [1])
+        assert named <= report.not_carried.keys()
+        assert env.point.x.tolist() == [0, 2, 0, 0] and type(env.point) is Point
+        assert env.data_each[:, 0].tolist() == [1, 0, 1, 1]
+    finally:
+        del env.deep, env.odd, env.data, env.data_each, env.point, env.view
+
+
+def test_a_value_that_has_rows_now_is_not_replaced_by_one_for_the_batch(env: Any) -> None:
+    env.scale, env.words = torch.zeros(3), ["a"] * N
+    snapshot = take_snapshot(env)
+    env.scale = torch.full((N,), 5.0)
+    env.words = [f"{i}" for i in range(N)]
+    report = restore_snapshot(env, snapshot)
+    assert "scale" in report.not_carried and env.scale.tolist() == [5.0] * N
+    assert env.words == ["a"] * N
+    env.words = [f"{i}" for i in range(N)]
+    restore_snapshot(env, snapshot, [2])
+    assert env.words == ["0", "1", "a", "3"]
+    env.words = env.words[:2]
+    report = restore_snapshot(env, snapshot, [2])
+    assert "words" in report.not_carried and env.words == ["0", "1"]
+    del env.scale, env.words

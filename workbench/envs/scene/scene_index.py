@@ -322,14 +322,18 @@ def in_every_env(env: Any, struct: Any, value: Any) -> Any:
     """`value` with a row for each env, NaN where an env lacks the struct; all NaN if the struct is unknown.
 
     Args:
-        value: a value of `struct`, with a row for each env that has the struct.
+        value: a value of `struct`, with a row for each env that has the struct; a single number holds for all envs.
     """
-    if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
+    if not isinstance(value, torch.Tensor) or value.shape[:1] == (env.num_envs,):
         return value
-    whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)
+    if value.ndim == 0:
+        return value.expand(env.num_envs)
+    # Integers and bools have no NaN.
+    dtype = value.dtype if value.is_floating_point() else torch.float32
+    whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan, dtype=dtype)
     envs = () if struct is None else maniskill_private.envs_of(struct)
     if len(envs) == len(value):
-        whole[torch.as_tensor(envs, device=value.device)] = value
+        whole[torch.as_tensor(envs, device=value.device)] = value.to(dtype)
     return whole
 
 
