@@ -51,6 +51,7 @@ def test_joints_equal_sapiens(pick: TaskEnv) -> None:
     for env in range(3):
         own = maniskill_private.objects_of(robots)[env]
         [read] = inspect_env(pick, env, ["joints"]).joints
+        assert read.kinds == tuple(joint.type for joint in own.active_joints) and len(set(read.kinds)) > 1
         assert read.articulation == "panda" and read.names[0] == "panda_joint1" and len(read.names) == 9
         np.testing.assert_array_equal(read.position, own.qpos)
         np.testing.assert_array_equal(read.velocity, own.qvel)
@@ -193,7 +194,11 @@ class Various(Bare):
     def _load_scene(self, options: dict) -> None:
         box(self, "floor", [3, 3, 0.1], sapien.Pose([0, 0, -0.1]), "static")
         self.light = box(self, "light", pose=sapien.Pose([1, 0, 0.0499]))
-        self.heavy = box(self, "heavy", pose=sapien.Pose([0, 0, 0.0499]))
+        builder = self.scene.create_actor_builder()
+        for z in (0, 0.004):  # the second shape is only near the floor
+            builder.add_box_collision(sapien.Pose([0.2 * (z > 0), 0, z]), half_size=BOX)
+        builder.initial_pose = sapien.Pose([0, 0, 0.0499])
+        self.heavy = builder.build("heavy")
         for number, body in enumerate(self.heavy._bodies):
             body.mass = 5.0 + number
         # Nearer than the contact offsets: PhysX lists the pair.
@@ -262,7 +267,7 @@ def test_each_section_is_that_of_the_env(various: TaskEnv, env: int) -> None:
     body = own.heavy._bodies[env]
     assert read.body.mass == pytest.approx(5 + env) and read.body.has_gravity
     np.testing.assert_array_equal(read.body.velocity, body.linear_velocity)
-    np.testing.assert_allclose(read.body.centre_of_mass, [0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(read.body.centre_of_mass, body.cmass_local_pose.p, atol=1e-6)
     rare = inspect_env(various, env, [], "rare").body
     assert (rare is None) == (env != 1)
     if rare is not None:
