@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw
 
 from tests.drive.render_device import RENDER_BACKEND, RENDER_DEVICE
 from tests.envs.drawn_envs import batched, stock
+from tests.envs.stock_env import Bare, batch_of
 from workbench.envs.scene.read_scene import read_geometry
 from workbench.envs.scene.scene_index import read_poses, scene_index
 from workbench.envs.scene.shapes import SceneGeometry, Visual
@@ -237,6 +238,26 @@ class OddShapesEnv(PushCubeEnv):
         pixels[0], pixels[..., 3] = 0.5, 1.0
         grey.base_color_texture = sapien.render.RenderTexture2D(pixels, "R32G32B32A32Sfloat")
         kinematic("linear", lambda b: b.add_box_visual(half_size=[0.1, 0.1, 0.1], material=grey))
+        for name, texels in (("one byte", np.full((4, 4, 1), 51, np.uint8)), ("bytes", PIXELS)):
+            plain = sapien.render.RenderMaterial(base_color=[1, 0, 0, 1], metallic=0.25, roughness=0.75)
+            formats = {1: "R8Unorm", 4: "R8G8B8A8Unorm"}
+            plain.base_color_texture = sapien.render.RenderTexture2D(texels, formats[texels.shape[-1]])
+            kinematic(name, lambda b, m=plain: b.add_box_visual(half_size=[0.1, 0.1, 0.1], material=m))
+        clear = sapien.render.RenderMaterial(base_color=[0.2, 0.4, 0.6, 0.0])
+        kinematic("clear", lambda b: b.add_box_visual(half_size=[0.1, 0.1, 0.1], material=clear))
+
+        def several(b: Any) -> None:
+            b.add_box_visual(half_size=[0.1, 0.2, 0.3], material=color)
+            b.add_box_visual(turned, half_size=[0.1, 0.2, 0.3], material=color)
+            b.add_box_visual(sapien.Pose(q=[0, 1, 0, 0]), half_size=[0.1, 0.2, 0.4], material=color)
+            b.add_cylinder_visual(radius=0.1, half_length=0.2, material=color)
+            b.add_cylinder_visual(radius=0.1, half_length=0.3, material=color)
+
+        kinematic("several", several)
+
+
+PIXELS = np.zeros((4, 4, 4), np.uint8)
+PIXELS[..., 0], PIXELS[..., 3] = 51, 102
 
 
 @pytest.fixture
@@ -274,6 +295,82 @@ def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any)
     texture = visual["linear/0"].material.texture
     assert texture is not None and texture.shape == (4, 4, 4)
     assert (texture[0, :, :3] == 188).all() and (texture[1:, :, :3] == 0).all()  # 0.5 linear is 188 sRGB
+
+
+def test_materials_and_textures_of_other_formats_are_read(odd_shapes: Any) -> None:
+    visual = {v.name: v for v in read_geometry(odd_shapes).visuals}
+    one, four = visual["one byte/0"].material, visual["bytes/0"].material
+    assert one.texture is not None and four.texture is not None
+    encoded = round(255 * (1.055 * (51 / 255) ** (1 / 2.4) - 0.055))
+    assert one.texture[0, 0].tolist() == [encoded, encoded, encoded, 255]
+    assert four.texture[0, 0].tolist() == [encoded, 0, 0, 102]
+    for material in (one, four):
+        assert material.base_color == (1, 1, 1, 1), "a texture replaces the colour"
+        assert (material.metallic, material.roughness) == (0.25, 0.75)
+    assert not any(name.startswith("clear/") for name in visual), "what is invisible is left out"
+
+
+def test_shapes_of_a_body_are_told_apart_by_size_and_place(odd_shapes: Any) -> None:
+    names = {v.name: v for v in read_geometry(odd_shapes).visuals}
+    extents = [np.ptp(names[f"several/{k}"].mesh.vertices, axis=0) / 2 for k in range(4)]
+    # The second is that of the body "box", which was read before.
+    np.testing.assert_allclose(
+        extents, [[0.1, 0.2, 0.3], [0.1, 0.2, 0.4], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1]], atol=2e-3
+    )
+    box = names["box/0"]
+    owners = [odd_shapes.scene.actors["box"], odd_shapes.scene.actors["several"]]
+    index = scene_index(odd_shapes)
+    assert [index.names[body] for body in box.bodies] == [owner.name for owner in owners]
+
+
+class CollisionsEnv(Bare):
+    """Collision shapes of every kind; the same ball as a static, a kinematic and a dynamic body."""
+
+    mesh_file = ""
+
+    def _load_scene(self, options: dict) -> None:
+        turned = sapien.Pose([0.01, 0.02, 0.03], [0.7071068, 0, 0, 0.7071068])  # a quarter turn about z
+
+        def built(name: str, add: Any, kind: str = "dynamic") -> None:
+            builder = self.scene.create_actor_builder()
+            add(builder)
+            builder.initial_pose = sapien.Pose([0, 0, 2])
+            builder.build_dynamic(name) if kind == "dynamic" else getattr(builder, f"build_{kind}")(name)
+
+        for kind in ("static", "kinematic", "dynamic"):
+            built(kind, lambda b: b.add_sphere_collision(radius=0.1), kind)
+        built("pill", lambda b: b.add_capsule_collision(turned, radius=0.1, half_length=0.3))
+        built("can", lambda b: b.add_cylinder_collision(turned, radius=0.1, half_length=0.2))
+        for name, scale in (("wedge", [1.0, 1.0, 1.0]), ("mirrored", [-2.0, 1.0, 0.5])):
+            built(name, lambda b, s=scale: b.add_convex_collision_from_file(self.mesh_file, scale=s))
+
+
+def test_collision_shapes_have_their_size_place_and_the_colour_of_their_kind(tmp_path: Path) -> None:
+    wedge = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    )
+    wedge.export(tmp_path / "wedge.obj")
+    CollisionsEnv.mesh_file = str(tmp_path / "wedge.obj")
+    env = batch_of(CollisionsEnv, 2)
+    visual = {v.name: v for v in read_geometry(env).visuals}
+    bounds = {
+        "pill/0": ([-0.09, -0.38, -0.07], [0.11, 0.42, 0.13]),
+        "can/0": ([-0.09, -0.18, -0.07], [0.11, 0.22, 0.13]),
+        "static/0": ([-0.1] * 3, [0.1] * 3),
+        "wedge/0": ([0, 0, 0], [1, 1, 1]),
+        "mirrored/0": ([-2, 0, 0], [0, 1, 0.5]),
+    }
+    for name, (low, high) in bounds.items():
+        mesh = visual[name].mesh
+        np.testing.assert_allclose(mesh.vertices.min(axis=0), low, atol=3e-3, err_msg=name)
+        np.testing.assert_allclose(mesh.vertices.max(axis=0), high, atol=3e-3, err_msg=name)
+        assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume > 0, name
+        assert visual[name].envs.tolist() == [0, 1]
+    colours = {visual[f"{kind}/0"].material.base_color for kind in ("static", "kinematic", "dynamic")}
+    assert (
+        len(colours) == 3 and visual["pill/0"].material.base_color == visual["dynamic/0"].material.base_color
+    )
+    env.close()
 
 
 def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
