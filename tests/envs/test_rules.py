@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,8 +16,8 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import CPU, PICK_CUBE, batched
-from workbench.envs.broken_rule import MAX_PLACES, BrokenRule, BrokenRules, RuleWarning
-from workbench.envs.gpu_rules import Finding, degrees_of
+from workbench.envs.broken_rule import MAX_PLACES, BrokenRule, BrokenRules, RuleWarning, frames_of_the_task
+from workbench.envs.gpu_rules import Finding, degrees_of, fails, silence_of
 
 N = 3
 
@@ -116,6 +117,93 @@ def test_a_comment_silences_its_line_until_the_file_is_edited(tmp_path: Path) ->
     assert [(finding.line, silence.reason) for finding, silence in rules.silenced] == [(1, "the GPU is far")]
     rules.edited(lambda row: (str(file), row.line or 0))
     assert rules.silenced == () and [row.line for row in rules.rows] == [2]
+
+
+SILENCED = """\
+# workbench: off[not-applied] above the class
+class Task:
+    @decorated
+    def lift(self):  # workbench: off[rows-lost, not-applied] in the whole function
+        x = 1
+        # workbench: off[stepped-in-reset] alone above
+        y = 2
+        z = 3
+
+    def drop(self):
+        a = 1  # workbench: off[rows-lost]
+        b = 2  # workbench: off[rows-lost] not of the next line
+        c = 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "rules"),
+    [
+        (1, {"not-applied"}),
+        (2, {"not-applied"}),
+        (3, {"rows-lost", "not-applied"}),  # the decorator belongs to its function
+        (5, {"rows-lost", "not-applied"}),
+        (7, {"rows-lost", "not-applied", "stepped-in-reset"}),
+        (8, {"rows-lost", "not-applied"}),
+        (10, set()),
+        (11, set()),  # without a reason a comment silences nothing
+        (12, {"rows-lost"}),
+        (13, set()),
+    ],
+)
+def test_a_comment_silences_its_line_the_next_if_alone_and_the_whole_function(
+    tmp_path: Path, line: int, rules: set[str]
+) -> None:
+    file = tmp_path / "task.py"
+    file.write_text(SILENCED)
+    every = ("not-applied", "rows-lost", "stepped-in-reset", "link-pose-set")
+    assert {rule for rule in every if silence_of(str(file), line, rule)} == rules
+    assert silence_of(None, line, "rows-lost") is silence_of("<string>", line, "rows-lost") is None
+
+
+@pytest.mark.parametrize(
+    ("fail_on", "failing"), [("stop", ["stop"]), ("warn", ["stop", "warn"]), ("never", [])]
+)
+def test_findings_of_a_degree_make_a_command_fail(fail_on: Any, failing: list[str]) -> None:
+    assert [degree for degree in ("stop", "warn", "off") if fails(cast(Any, degree), fail_on)] == failing
+
+
+def test_a_row_takes_the_exact_line_once_it_is_known_and_keeps_it(tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    file.write_text("first\nsecond\nthird\n")
+    rules = broken_rules()
+
+    def breach(line: int, exact: bool) -> Finding:
+        place = (str(file), line, "draw")
+        if exact:
+            frame = compile("\n" * (line - 1) + "frames = here()", str(file), "exec")
+            known: dict[str, Any] = {"__name__": "task", "here": frames_of_the_task}
+            exec(frame, known)
+            rules.report_breach("rows-rewritten", "drawn", known["frames"], subject="target")
+        else:
+            rules.report_breach("rows-rewritten", "drawn", None, place, subject="target")
+        (row,) = rules.rows
+        return row
+
+    assert [(row.line, row.code, row.count) for row in [breach(1, False)]] == [(1, "first", 1)]
+    for number, line in enumerate((2, 3)):
+        row = breach(line, True)
+        assert (row.line, row.code, row.count) == (2, "second", 2 + number)
+    assert breach(1, False).line == 2
+    rules.edited(lambda row: (str(file), 3))
+    (row,) = rules.rows
+    assert (row.line, row.code) == (3, "third")
+    assert row.key != replace(row, code="second").key and row.key == replace(row, line=9, count=1).key
+
+
+def test_a_rule_that_is_off_reports_nothing_and_one_that_stops_names_its_line() -> None:
+    rules = BrokenRules({"rows-lost": "off", "not-applied": "stop", "evaluate-rows": "off"}, lambda _: None)
+    rules.report_breach("rows-lost", "lost", None, ("task.py", 7, "lift"))
+    rules.returned("evaluate-rows", "evaluate", "is wrong", None)
+    assert rules.rows == ()
+    with pytest.raises(BrokenRule) as caught:
+        rules.report_breach("not-applied", "lost", None, ("task.py", 7, "lift"))
+    assert (caught.value.rule, caught.value.place) == ("not-applied", ("task.py", 7, "lift"))
 
 
 def test_each_of_several_lost_writes_is_reported() -> None:

@@ -12,12 +12,13 @@ from mani_skill.utils import common
 
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.envs.hot_swap import put_class
+from workbench.envs.inspect_env import inspect_env
 from workbench.envs.recorded_run import states_of
 from workbench.envs.state_columns import StateReading, read_state_columns
 from workbench.envs.task_env import TaskEnv
 
 
-def made(env_id: str, num_envs: int = 3, **kwargs: Any) -> TaskEnv:
+def made(env_id: Any, num_envs: int = 3, **kwargs: Any) -> TaskEnv:
     task = TaskEnv(batched(env_id, num_envs, **kwargs))
     task.reset(seed=0)
     task.step(None)
@@ -52,6 +53,47 @@ def test_kinematic_actors_have_zero_velocity_even_after_a_write() -> None:
         column = columns[f"state/actors/{actor.name}"]
         assert (column[:, 7:10] == speed).all()
         np.testing.assert_array_equal(column, actor.get_state().numpy())
+    task.close()
+
+
+def test_of_an_observation_with_pictures_the_flat_part_is_split_and_pictures_are_left_out() -> None:
+    task = made("PickCube-v1", obs_mode="state")
+    flat = read_state_columns(task)
+    picture = {"base_camera": {"rgb": torch.zeros(3, 4, 4, 3)}}
+    kept = task.obs.clone()
+    task.obs = {"state": task.obs, "sensor_data": picture, "sensor_param": picture, "mean": torch.tensor(1.0)}
+    task.obs |= {
+        "pointcloud": {"xyzw": torch.zeros(3, 9, 4)},
+        "two": torch.zeros(2, 3),
+        "each": torch.arange(3.0),
+    }
+    columns = read_state_columns(task)
+    assert columns.keys() == flat.keys() | {"obs/each"}
+    for name, column in flat.items():
+        np.testing.assert_array_equal(columns[name], column)
+    read = {leaf.name: leaf for leaf in inspect_env(task, 1, ["observation"]).observation or ()}
+    np.testing.assert_array_equal(read["agent/qpos"].values, columns["obs/agent/qpos"][1])
+    assert read["each"].values.tolist() == [1] and read["mean"].values.tolist() == [1]
+    assert read["sensor_data/base_camera/rgb"].shape == (4, 4, 3)
+    kept += 1
+    task.env.step(None)
+    assert not np.shares_memory(columns["obs/agent/qpos"], task.env.agent.robot.qpos.numpy())
+    task.close()
+
+
+class FlattensItself(PICK_CUBE):
+    """An observation whose width is not that of its named parts."""
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        return torch.cat([super()._flatten_raw_obs(obs), torch.arange(3.0)[:, None]], dim=1)
+
+
+def test_an_observation_that_a_task_flattens_in_its_own_way_has_no_names() -> None:
+    task = made(FlattensItself, obs_mode="state")
+    columns = {name: column for name, column in read_state_columns(task).items() if name.startswith("obs/")}
+    assert [*columns] == ["obs/"] and columns["obs/"].shape == task.obs.shape
+    [leaf] = inspect_env(task, 2, ["observation"]).observation or ()
+    assert leaf.shape == task.obs.shape[1:] and leaf.high == float(task.obs[2].max())
     task.close()
 
 

@@ -15,7 +15,9 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs import Actor, Pose
 
 from tests.drive.envs import batched, stock
-from workbench.envs.scene.scene_index import read_poses, scene_index
+from tests.envs.by_hand import box, by_hand
+from tests.envs.stock_env import Bare, batch_of
+from workbench.envs.scene.scene_index import joint_names, read_joints, read_poses, scene_index
 
 TASKS = ["PickCube-v1", "PegInsertionSide-v1"]
 
@@ -134,3 +136,57 @@ def test_the_index_is_freed_with_its_scene() -> None:
     del env
     gc.collect()
     assert scene() is None and index() is None
+
+
+class SameNames(Bare):
+    """An actor that is called like a link, two chains, and actors that are hidden in some envs only."""
+
+    def _load_scene(self, options: dict) -> None:
+        box(self, "left/link0", pose=sapien.Pose([1, 0, 1]))
+        self.left, self.right = by_hand(self, 1, "left"), by_hand(self, 2, "right")
+        for number in range(self.num_envs):
+            builder = self.scene.create_actor_builder()
+            builder.add_sphere_collision(radius=0.02)
+            builder.initial_pose = sapien.Pose([2, 0, 1 + number])
+            builder.set_scene_idxs([number])
+            body = builder.build_kinematic(f"mark-{number}")
+            if number == 1:
+                self._hidden_objects.append(body)
+            self.marks = [*getattr(self, "marks", []), body]
+        self.mark = Actor.merge(self.marks, name="mark")
+
+
+def test_bodies_and_joints_of_the_same_name_are_told_apart() -> None:
+    env: Any = batch_of(SameNames, 3)
+    index = scene_index(env)
+    assert len(set(index.names)) == len(index.names)
+    actor, link = (
+        next(
+            name
+            for name, owner in zip(index.names, index.owners, strict=True)
+            if owner == of and "link0" in name
+        )
+        for of in ("left/link0", "left")
+    )
+    assert actor == "left/link0" and link != actor
+    env.left.set_qpos(torch.tensor([[0.1], [0.2], [0.3]]))
+    env.right.set_qpos(torch.tensor([[0.4, 0.5], [0.6, 0.7], [0.8, 0.9]]))
+    env.apply()
+    poses = read_poses(env)
+    np.testing.assert_allclose(poses[:, index.names.index(actor), :3], [[1, 0, 1]] * 3)
+    np.testing.assert_array_equal(poses[:, index.names.index(link)], env.left.links[1].pose.raw_pose)
+    assert joint_names(env) == ("left/hinge0", "right/hinge0", "right/hinge1")
+    joints = read_joints(env)
+    assert joints is not None
+    np.testing.assert_allclose(joints, [[0.1, 0.4, 0.5], [0.2, 0.6, 0.7], [0.3, 0.8, 0.9]], rtol=1e-6)
+    # What one env hides counts as hidden in all: it is one body.
+    hidden = {name for name, is_hidden in zip(index.names, index.hidden, strict=True) if is_hidden}
+    assert hidden == {"mark"}
+    column = index.names.index("mark")
+    np.testing.assert_allclose(poses[:, column, 2], [1, 2, 3])
+    for number in range(3):
+        assert index.name_of(env.marks[number]._objs[0]) == "mark"
+        row = index.row_of(number, "mark")
+        assert env.scene.px.cuda_rigid_body_data.torch()[row, 2] == 1 + number
+    assert index.row_of(0, link) is not None and index.name_of(sapien.Entity()) is None
+    env.close()
