@@ -15,7 +15,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import assets, download_asset
 
 from tests.drive.envs import batched
-from workbench.envs.assets import MissingAssets, assets_at, refuse_downloads, require_assets
+from workbench.envs.assets import MissingAssets, assets_at, refuse_downloads, require_assets, robots_of
 
 NOT_HERE = "anymal_c"
 
@@ -76,6 +76,55 @@ def test_an_error_about_a_downloadable_file_names_its_download(
     assert isinstance(caught.value.__cause__, FileNotFoundError)
     with pytest.raises(MissingAssets, match="AI2THOR"), refuse_downloads("Some"):
         raise RuntimeError(f"failed to load mesh {missing}.")
+
+
+def test_advice_of_maniskills_own_error_is_taken() -> None:
+    with pytest.raises(MissingAssets) as caught, refuse_downloads("Some"):
+        raise RuntimeError("Run `python -m mani_skill.utils.download_asset ycb` first")
+    assert caught.value.names == ("ycb",)
+    for text in ("python -m mani_skill.utils.download_asset no_such_thing", "something else"):
+        with pytest.raises(KeyError), refuse_downloads("Some"):
+            raise KeyError(text)
+
+
+def test_the_robots_of_a_task_are_those_given_else_the_constructors_default() -> None:
+    class Defaults:
+        def __init__(self, robot_uids: Any = ("panda", "fetch")) -> None: ...
+
+    class Passes:
+        def __init__(self, **kwargs: Any) -> None: ...
+
+    class Needs:
+        def __init__(self, robot_uids: Any) -> None: ...
+
+    assert robots_of(Defaults, {}) == ("panda", "fetch")
+    assert (
+        robots_of(Defaults, {"robot_uids": "so100"}) == robots_of(Passes, {"robot_uids": "so100"}) == "so100"
+    )
+    assert robots_of(Passes, {}) is robots_of(Needs, {}) is None
+
+
+@pytest.mark.parametrize("folder", ["", "robots"])
+def test_a_relative_path_of_a_robot_is_told_from_the_working_directory(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = Path(folder) / "arm.urdf"
+
+    class Arm(Panda):
+        uid = "arm_with_a_relative_path"
+        urdf_path = str(file)
+
+    class Task(BaseEnv):
+        SUPPORTED_ROBOTS = None  # type: ignore[assignment]  # any
+
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            robot: Any = Arm
+            super().__init__(*args, robot_uids=robot, **kwargs)
+
+    with pytest.raises(MissingAssets) as caught:
+        batched(Task)
+    assert str(tmp_path / file) in str(caught.value) and caught.value.place is not None
 
 
 def test_a_custom_robot_with_a_wrong_path_is_reported_at_its_line(tmp_path: Path) -> None:

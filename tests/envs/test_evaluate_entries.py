@@ -18,7 +18,17 @@ import workbench
 from tests.drive.entries import ENTRIES, Mute
 from tests.drive.envs import CPU, batched
 from tests.live.odd_entries import write_task
-from workbench.envs.evaluate_entries import MAX_ENTRIES, MAX_TEXT_CHARACTERS, split_entries
+from workbench.envs.evaluate_entries import (
+    MAX_ENTRIES,
+    MAX_TEXT_CHARACTERS,
+    no_reward,
+    split_entries,
+    without_rows,
+    wrong_evaluate,
+    wrong_flags,
+    wrong_observation,
+    wrong_reward,
+)
 from workbench.envs.maniskill_private import open_env
 from workbench.envs.task_env import TaskEnv
 from workbench.task.load import load_task
@@ -116,6 +126,111 @@ def test_any_dict_is_split(entries: dict[Any, Any], num_envs: int) -> None:
         name.encode()
         assert len(entry.texts) == (0 if entry.numbers is not None else num_envs if entry.per_env else 1)
         "".join(entry.texts).encode()
+
+
+class Plain:
+    """Has Python's own repr, with its address."""
+
+
+def test_a_text_is_the_same_in_every_run_and_has_the_tasks_digits() -> None:
+    kept = [Plain(), Plain()]
+    texts = [split_entries({"object": each}, N)[1]["object"].texts for each in kept]
+    assert texts[0] == texts[1] and "Plain" in texts[0][0]
+    assert split_entries({"number": np.complex64(1 + 2j)}, N)[1]["number"].texts == ("(1+2j)",)
+    each = split_entries({"each": [f"env {i}" for i in range(N)]}, N)[1]["each"]
+    assert each.per_env and [each.of_env(i).texts for i in range(N)] == [(f"env {i}",) for i in range(N)]
+
+
+@pytest.mark.parametrize(
+    ("value", "flags"),
+    [
+        (torch.tensor([0.0, 2.0, 0.0, -1.0]), [False, True, False, True]),
+        (np.array([0, 1, 1, 0]), [False, True, True, False]),
+        (torch.tensor([[True], [False], [True], [False]]), [True, False, True, False]),
+        (True, [True] * N),
+        (torch.tensor(0), [False] * N),
+    ],
+)
+def test_success_is_a_bool_for_each_env(value: Any, flags: list[bool]) -> None:
+    columns, _ = split_entries({"success": value}, N)
+    assert columns["success"].dtype == bool and columns["success"].tolist() == flags
+
+
+@pytest.mark.parametrize(
+    ("obs", "named"),
+    [
+        ({}, None),
+        ({"a": {"b": torch.zeros(N, 2), "c": np.zeros(N)}}, None),
+        ({"a": {"b": torch.zeros(N, 2), "c": torch.zeros(2)}}, "a/c"),
+        ({"a": torch.tensor(1.0)}, "a"),
+        ({"a": 1.0}, "a"),
+        ({"a": [0.0] * N}, "a"),
+        (None, ""),
+        (torch.zeros(N, 3), ""),
+    ],
+)
+def test_an_observation_without_rows_is_named(obs: Any, named: str | None) -> None:
+    problem = wrong_observation(obs, N)
+    assert (problem is None) == (named is None)
+    assert problem is None or repr(named) in problem or named == ""
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "named"), [(N, ["few", "inner/few", "scalar"]), (1, ["rows", "few", "inner/few", "column"])]
+)
+def test_values_without_rows_are_found_in_nested_dicts(num_envs: int, named: list[str]) -> None:
+    value = {"rows": torch.zeros(N, 2), "few": torch.zeros(2), "inner": {"few": np.zeros((3, N))}}
+    value |= {"scalar": torch.tensor(1.0), "text": "a", "column": torch.zeros(N)}
+    assert [name for name, _ in without_rows(value, num_envs)] == named
+
+
+@pytest.mark.parametrize(
+    ("reward", "num_envs", "wrong", "none"),
+    [
+        (torch.zeros(N), N, False, False),
+        (torch.full((N,), torch.nan), N, False, False),
+        (torch.zeros(N, 1), N, True, True),
+        (torch.zeros(N - 1), N, True, True),
+        (torch.zeros(N, dtype=torch.int64), N, True, False),
+        (torch.zeros(N, dtype=torch.complex64), N, True, True),
+        (np.zeros(N), N, True, True),
+        (0.0, 1, True, True),
+        (torch.tensor(0.0), 1, False, False),
+        (torch.zeros(1), 1, False, False),
+        (torch.zeros(1, 1), 1, True, False),
+        (EACH > 1, N, False, False),  # ManiSkill's own sparse reward is `success` itself
+        (EACH > 2, N, True, False),
+    ],
+)
+def test_a_reward_is_floats_with_a_row_for_each_env(
+    reward: Any, num_envs: int, wrong: bool, none: bool
+) -> None:
+    assert (wrong_reward(reward, num_envs, {"success": EACH > 1}) is not None) == wrong
+    assert (no_reward(reward, num_envs) is not None) == none
+
+
+@pytest.mark.parametrize(
+    ("evaluate", "num_envs", "wrong", "flags"),
+    [
+        ({"success": EACH > 1, "other": None}, N, False, False),
+        ({"success": EACH}, N, False, True),
+        ({"fail": EACH > 1, "success": (EACH > 1).int()}, N, False, True),
+        ({"success": torch.zeros(N, 1, dtype=torch.bool)}, N, True, False),
+        ({"fail": True}, N, True, False),
+        ({"fail": EACH.cfloat()}, N, True, True),
+        ({"fail": None}, N, True, False),
+        ({"success": torch.tensor(True)}, 1, False, False),
+        ({"success": torch.tensor([[True]])}, 1, False, True),
+        ({"success": torch.tensor(True)}, N, True, False),
+        (None, N, True, False),
+        ([], N, True, False),
+    ],
+)
+def test_success_and_fail_are_bools_with_a_row_for_each_env(
+    evaluate: Any, num_envs: int, wrong: bool, flags: bool
+) -> None:
+    assert (wrong_evaluate(evaluate, num_envs) is not None) == wrong
+    assert (wrong_flags(evaluate) is not None) == flags
 
 
 # --- the same in stock ManiSkill ---------------------------------------------------------------------

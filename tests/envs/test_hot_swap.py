@@ -12,7 +12,8 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PUSH_CUBE, batched
-from workbench.envs.hot_swap import put_class, rehearse_hooks
+from workbench.envs.hot_swap import keep_observation_space, put_class, rehearse_hooks
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 
 pytestmark = [
     pytest.mark.thorough,
@@ -107,3 +108,34 @@ def test_another_class_continues_from_the_same_state_with_the_same_rules() -> No
     assert env.broken_rules.degree("rows-lost") == reference.broken_rules.degree("rows-lost") == "warn"
     env.close()
     reference.close()
+
+
+def test_another_class_keeps_how_the_env_was_made_also_for_its_next_scene() -> None:
+    made = EnvOptions(2, "cpu", render=False, pictures="fast", threads=1, rules="off")
+    env: Any = make_env(Plain, made)
+    put_class(env, type("Edited", (Plain,), {}))
+    env.reset(seed=0, options={"reconfigure": True})
+    assert env.scene.pictures == "fast" and env.scene.px.stepper.threads == 1
+    assert TaskEnv(env).broken_rules is None
+    env.close()
+
+
+class SeesMore(Plain):
+    def _get_obs_extra(self, info: dict) -> dict:
+        return {**super()._get_obs_extra(info), "more": torch.zeros(self.num_envs, 5)}
+
+
+def test_the_observation_space_follows_an_edited_hook() -> None:
+    env = batched(Plain, 2, obs_mode="state")
+    width = env.observation_space.shape[1]
+    put_class(env, SeesMore)
+    obs, _ = env.reset(seed=0)
+    keep_observation_space(env, obs)
+    assert env.observation_space.shape == obs.shape == (2, width + 5)
+    assert env.single_observation_space.shape == (width + 5,)
+    env.close()
+    blind = batched(Plain, 2, obs_mode="none")
+    space = blind.observation_space
+    keep_observation_space(blind, {})
+    assert blind.observation_space is space
+    blind.close()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from workbench.envs.scene.mesh_levels import deviation, from_afar, reduced_mesh
+from workbench.envs.scene.mesh_levels import are_known, deviation, from_afar, levels_of, reduced_mesh, within
 from workbench.envs.scene.shapes import Mesh
 
 
@@ -62,3 +62,29 @@ def test_simple_and_textured_meshes_are_not_reduced_for_distance() -> None:
     uvs = np.zeros((len(ball.vertices), 2), np.float32)
     textured = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32), uvs=uvs)
     assert from_afar(textured, 0.1) is textured
+
+
+def test_levels_have_ever_fewer_triangles_and_the_distance_that_they_claim(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    solid = trimesh.creation.icosphere(subdivisions=3, radius=0.137)
+    mesh = Mesh(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
+    assert not are_known(mesh)
+    levels = levels_of(mesh)
+    counts = [len(level.mesh.faces) for level in levels]
+    errors = [level.error for level in levels]
+    assert len(levels) >= 3 and counts == sorted(counts, reverse=True) and counts[0] < len(mesh.faces)
+    assert errors == sorted(errors) and 0 < errors[0] < errors[-1]
+    for level in levels:
+        assert deviation(mesh, level.mesh) <= level.error * 1.001
+    assert are_known(mesh) and levels_of(mesh) is levels
+    for level, finer in zip(levels, (None, *levels), strict=False):
+        assert within(mesh, level.error) is level.mesh
+        assert within(mesh, level.error * 0.999) is (mesh if finer is None else finer.mesh)
+    with_normals = Mesh(mesh.vertices, mesh.faces, mesh.vertices / np.float32(0.137))
+    textured = Mesh(mesh.vertices, mesh.faces, uvs=np.zeros((len(mesh.vertices), 2), np.float32))
+    assert not are_known(with_normals) and not are_known(textured)
+    flat = Mesh(mesh.vertices * [1, 1, 0], mesh.faces)
+    assert deviation(mesh, flat) == pytest.approx(0.137, rel=0.05) and deviation(flat, mesh) > 0
+    assert deviation(mesh, mesh) == pytest.approx(0, abs=2e-3)
