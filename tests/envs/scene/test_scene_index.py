@@ -17,7 +17,9 @@ from mani_skill.utils.structs import Actor, Pose
 from tests.drive.envs import batched, stock
 from tests.envs.by_hand import box, by_hand
 from tests.envs.stock_env import Bare, batch_of
-from workbench.envs.scene.scene_index import joint_names, read_joints, read_poses, scene_index
+from tests.envs.written import Written
+from workbench.envs.maniskill_private import setting_only
+from workbench.envs.scene.scene_index import joint_names, present_states, read_joints, read_poses, scene_index
 
 TASKS = ["PickCube-v1", "PegInsertionSide-v1"]
 
@@ -189,4 +191,32 @@ def test_bodies_and_joints_of_the_same_name_are_told_apart() -> None:
         row = index.row_of(number, "mark")
         assert env.scene.px.cuda_rigid_body_data.torch()[row, 2] == 1 + number
     assert index.row_of(0, link) is not None and index.name_of(sapien.Entity()) is None
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+@pytest.mark.parametrize("kept", [1, 3])
+def test_after_a_body_was_removed_or_built_each_row_is_that_of_its_body(kept: int) -> None:
+    env: Any = batch_of(Written, 3)
+    env.reset(seed=0)
+    env.falls.set_pose(Pose.create_from_pq(torch.tensor([[0.1 * i, 0, 0.5] for i in range(3)])))
+    states, before = present_states(env), read_poses(env)
+    with setting_only(env, [0, 1, 2][-kept:]):
+        env.lies.remove_from_scene()
+    names = scene_index(env).names
+    poses, now = read_poses(env), present_states(env)
+    index = scene_index(env)
+    for name in names:
+        column, gone = index.names.index(name), np.zeros(3, bool)
+        gone[-kept:] = name == "lies"
+        np.testing.assert_array_equal(np.isnan(poses[:, column, 0]), gone, err_msg=name)
+        np.testing.assert_array_equal(poses[~gone, column], before[~gone, names.index(name)], err_msg=name)
+    for name in ("actors/falls", "articulations/chain"):
+        np.testing.assert_array_equal(np.asarray(now[name]), np.asarray(states[name]))
+    late = box(env, "late", pose=sapien.Pose([4, 4, 4]))
+    late.set_pose(sapien.Pose([5, 5, 5]))
+    poses = read_poses(env)
+    index = scene_index(env)
+    np.testing.assert_allclose(poses[:, index.names.index("late"), :3], [[5] * 3] * 3)
+    np.testing.assert_array_equal(poses[:, index.names.index("falls")], before[:, names.index("falls")])
     env.close()

@@ -167,6 +167,8 @@ def read_poses(env: Any) -> NDArray[np.float32]:
 
     NaN for bodies that an env lacks; the true pose for hidden ones.
     """
+    # First: after bodies were added or removed, this lays the scene out again, and rows belong to other bodies.
+    data = env.scene.px.cuda_rigid_body_data if env.scene.gpu_sim_enabled else None
     index = scene_index(env)
     poses = index.fixed.copy()
     flat = poses.reshape(-1, 7)
@@ -176,14 +178,14 @@ def read_poses(env: Any) -> NDArray[np.float32]:
             entity: Any = index.entities[env_idx, body]
             pose = entity.pose
             poses[env_idx, body] = [*pose.p, *pose.q]
-    if index.rows is None:
+    if data is None:
         # A stock CPU env has no such tensor, and does not move bodies to hide them.
         for slot, entity in enumerate(index.entities.ravel()):
             if entity is not None:
                 flat[slot] = [*entity.pose.p, *entity.pose.q]
         return poses
     # Gathered on the tensor's device, so that only a small copy goes to the host.
-    moved = rows_of(env.scene.px.cuda_rigid_body_data, index.rows)[:, :7]
+    moved = rows_of(data, index.rows)[:, :7]
     flat[index.slots] = moved if isinstance(moved, np.ndarray) else moved.cpu().numpy()
     for slots, kept in hidden_poses(env):
         flat[slots[slots >= 0]] = kept[slots >= 0]
@@ -277,8 +279,9 @@ class StateRows(NamedTuple):
 
 def state_rows(env: Any) -> StateRows:
     """Copy the present moment; ``states()`` then does the slow part of `present_states`."""
-    rows, still, places = _places_of_states(env)
     px = env.scene.px
+    data = px.cuda_rigid_body_data  # first, as in `read_poses`
+    rows, still, places = _places_of_states(env)
     asked = {
         name: in_every_env(env, struct, struct.get_state())
         for name, (struct, column, joints, _) in places.items()
@@ -286,7 +289,7 @@ def state_rows(env: Any) -> StateRows:
     }
     qpos, qvel = px.cuda_articulation_qpos.torch(), px.cuda_articulation_qvel.torch()
     qpos, qvel = (q.numpy().copy() if q.is_cpu else q.clone() for q in (qpos, qvel))
-    return StateRows(still, places, rows_of(px.cuda_rigid_body_data, rows), qpos, qvel, asked)
+    return StateRows(still, places, rows_of(data, rows), qpos, qvel, asked)
 
 
 @once_a_scene
