@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PUSH_CUBE, batched
+from tests.envs.written import Written
 from workbench.envs.hot_swap import keep_observation_space, put_class, rehearse_hooks
+from workbench.envs.scene.scene_index import read_poses
 from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 
 pytestmark = [
@@ -139,3 +142,51 @@ def test_the_observation_space_follows_an_edited_hook() -> None:
     keep_observation_space(blind, {})
     assert blind.observation_space is space
     blind.close()
+
+
+class WritesPastTheTensors(Written):
+    """``evaluate`` with `meddles` changes what is in no tensor: masses, joints, SAPIEN's objects, static and removed bodies."""
+
+    meddles = False
+
+    def evaluate(self) -> dict:
+        if self.meddles:
+            self.falls.set_mass(9.0)
+            self.first_joint.set_friction(0.9)
+            self.first_joint.set_drive_properties(70, 7)
+            self.falls._objs[0].set_pose(sapien.Pose([1, 2, 3]))
+            self.lies._bodies[1].linear_velocity = [1, 2, 3]
+            self.chain._objs[1].set_qpos(np.array([0.7, 0.7], np.float32))
+            self.wall.set_pose(sapien.Pose([3, 2, 1]))
+            self.wall._objs[1].pose = sapien.Pose([1, 1, 1])
+            self.lies.remove_from_scene()
+        return {}
+
+
+def beside_the_tensors(env: Any) -> tuple[Any, ...]:
+    joints = [joint for chain in env.chain._objs for joint in chain.active_joints]
+    return (
+        [system.pack() for system in env.scene.px.systems],
+        [len(scene.entities) for scene in env.scene.sub_scenes],
+        env.falls.mass.tolist(),
+        [(joint.friction, joint.stiffness, joint.damping) for joint in joints],
+        read_poses(env).tobytes(),
+        env.scene.px.static_moves,
+    )
+
+
+def test_a_rehearsal_changes_nothing_that_is_in_no_tensor() -> None:
+    env: Any = batched(WritesPastTheTensors, 2, rules="off", obs_mode="none", reward_mode="none")
+    env.reset(seed=0)
+    env.step(None)
+    before = beside_the_tensors(env)
+    env.meddles = True
+    for _ in range(2):
+        assert rehearse_hooks(env, ["evaluate"]) == {}
+        assert beside_the_tensors(env) == before
+    env.evaluate()
+    after = beside_the_tensors(env)
+    assert not any(now == was for now, was in zip(after, before, strict=True)), (
+        "outside of it all are changed"
+    )
+    env.close()

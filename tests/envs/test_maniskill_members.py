@@ -136,8 +136,19 @@ def test_setters_reach_only_the_chosen_envs_within_the_context() -> None:
     env.reset(seed=0)
     with pytest.raises(ZeroDivisionError), private.setting_only(env, [0, 2]):
         env.chain.set_qpos(torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+        env.falls.set_mass(3.0)
+        env.falls.set_disable_gravity(True)
+        env.first_joint.set_drive_properties(70, 7)
+        env.second_joint.set_limits([[-0.5, 0.5]])
+        env.last.set_linear_damping(0.7)
         raise ZeroDivisionError
     assert torch.equal(env.chain.qpos, torch.tensor([[0.1, 0.2], [0, 0], [0.3, 0.4]]))
+    bodies, joints = env.falls._bodies, [chain.active_joints for chain in env.chain._objs]
+    chosen = [True, False, True]
+    assert [body.mass == 3 for body in bodies] == [body.disable_gravity for body in bodies] == chosen
+    assert [first.stiffness == 70 for first, _ in joints] == chosen
+    assert [second.limits[0, 1] == 0.5 for _, second in joints] == chosen
+    assert [link.linear_damping == pytest.approx(0.7) for link in env.last._bodies] == chosen
     env.chain.set_qpos(torch.full((N, 2), 0.5))
     assert (env.chain.qpos == 0.5).all()
     env.close()

@@ -56,6 +56,21 @@ def test_the_first_observation_after_a_partial_reset_shows_kept_targets() -> Non
     env.close()
 
 
+def test_of_several_robots_each_keeps_its_targets_in_the_other_envs() -> None:
+    env = made("TwoRobotPickCube-v1", 3, control_mode="pd_joint_target_delta_pos")
+    env.reset(seed=[1, 2, 3])
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        env.step({name: rng.uniform(-1, 1, (3, 8)).astype(np.float32) for name in env.agent.agents_dict})
+    targets = [agent.controller.controllers["arm"]._target_qpos.clone() for agent in env.agent.agents]
+    env.reset(options={"env_idx": torch.tensor([0])})
+    for agent, before in zip(env.agent.agents, targets, strict=True):
+        now = agent.controller.controllers["arm"]._target_qpos
+        assert (now != before).any(dim=1).tolist() == [True, False, False]
+        assert torch.equal(now[0], agent.robot.qpos[0, :7])
+    env.close()
+
+
 class Starts(Bare):
     """Each env's generator draws the box's start position, which the scene and `start` hold."""
 
@@ -160,6 +175,18 @@ def test_given_states_are_assigned_as_by_set_state_and_observations_in_env_idx_o
     env.set_state_dict({"actors": {"box": moved}}, torch.tensor(named))
     assert torch.equal(env.box.pose.p, from_reset)
     assert (obs[1] == 1).all() and (obs[3] == 3).all() and not (obs[2] == 1).all()
+    env.close()
+
+
+def test_given_observations_may_be_nested() -> None:
+    env = batch_of(Starts, 4, obs_mode="state_dict")
+    env.reset(seed=[5, 6, 7, 8])
+    moved = env.get_state_dict()["actors"]["box"][[1, 3]].clone()
+    seen = {"agent": {}, "extra": {"start": torch.tensor([[3.0] * 3, [1.0] * 3])}}
+    given = {"env_states": {"actors": {"box": moved}}, "obs": seen}
+    obs, _ = env.reset(options={"env_idx": torch.tensor([3, 1]), "reset_to_env_states": given})
+    assert obs["extra"]["start"][[1, 3], 0].tolist() == [1, 3]
+    assert seen["extra"]["start"][0, 0] == 3, "the caller's observation stays"
     env.close()
 
 

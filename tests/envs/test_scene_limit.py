@@ -6,6 +6,7 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import pytest
 import sapien.physx as physx
 
+from tests.drive.envs import batched
 from workbench.envs.cpu_scene import free_thread_keys, require_scenes
 
 
@@ -28,3 +29,12 @@ def test_only_more_envs_than_fit_are_refused() -> None:
     require_scenes(room)
     with pytest.raises(ValueError, match=f"{room} are left here"):
         require_scenes(room + 1)
+
+
+def test_an_env_that_does_not_fit_is_refused_before_anything_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(*args: object) -> None:
+        raise AssertionError("a scene was begun")
+
+    monkeypatch.setattr(physx, "PhysxCpuSystem", build)
+    with pytest.raises(ValueError, match="are left here"):
+        batched("PickCube-v1", 5000)

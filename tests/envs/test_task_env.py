@@ -26,6 +26,7 @@ from workbench.envs.backends import BackendUnavailable, choose_backend
 from workbench.envs.error_notes import WrongAction
 from workbench.envs.maniskill_private import last_observation
 from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.task_drawings import Drawing, drawings
 from workbench.envs.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env, to_numpy
 
 pytestmark = pytest.mark.thorough
@@ -144,6 +145,20 @@ def test_a_result_is_a_copy_of_what_the_caller_and_the_task_keep(push: TaskEnv) 
     assert not (result.action.any() or result.evaluate["entry"].any() or result.reward.any())
     assert result.elapsed_steps.tolist() == [0] * N
     assert to_numpy(entry) is not entry and not np.shares_memory(to_numpy(entry), entry.numpy())
+
+
+def test_a_result_has_what_was_drawn_while_a_workbench_shows_it(
+    push: TaskEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawings.put("it", Drawing("points", np.ones((2, 1, 3), np.float32)))
+    try:
+        for on in (True, False):
+            monkeypatch.setattr(drawings, "on", on)
+            drawn = push.rescore().drawn
+            assert [*drawn] == (["it"] if on else [])
+            assert all(drawing.data.shape == (N, 1, 3) for drawing in drawn.values())
+    finally:
+        drawings.remove("it")
 
 
 @pytest.mark.parametrize("seeds", [[1], [1, 2, 3, 4, 5], []])

@@ -68,6 +68,8 @@ class TargetsWhileBuilt(Written):
             joint.set_drive_properties(50, 5)
         targets = self.per_env(None, (0.3, 0.1), (0.2, 0.1))
         self.chain.set_joint_drive_targets(targets, joints=self.chain.active_joints)
+        self.chain.set_joint_drive_velocity_targets(-0.5 * targets, joints=self.chain.active_joints)
+        self.see(targets=self.chain.drive_targets, velocities=self.chain.drive_velocities)
 
 
 class StepsWhileBuilt(Written):

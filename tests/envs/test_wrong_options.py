@@ -24,6 +24,10 @@ pytestmark = pytest.mark.usefixtures("renderer")
         ({"sensor_configs": {"base_camra": {"width": 64}}}, ["sensor_configs", "base_camra", "base_camera"]),
         ({"sensor_configs": {"base_camera": {"shader_pack": "rt-fats"}}}, ["base_camera", "rt-fast"]),
         ({"sensor_configs": {"widht": 64}}, ["widht", "width"]),
+        ({"sensor_configs": {"base_camera": {"heigth": 64}}}, ["base_camera", "heigth", "height"]),
+        ({"human_render_camera_configs": {"shader_pack": "defualt"}}, ["human_render", "defualt", "default"]),
+        ({"sim_config": {"sim_frq": 100}}, ["sim_config", "sim_frq", "sim_freq"]),
+        ({"robot_uids": ("panda", "fecth")}, ["robot_uids", "fecth", "fetch"]),
         ({"sim_config": {"scene_config": {"gravty": [0, 0, 0]}}}, ["scene_config", "gravty", "gravity"]),
     ],
 )

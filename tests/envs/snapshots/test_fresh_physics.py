@@ -19,6 +19,8 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
+from tests.envs.written import Written
+from workbench.envs.maniskill_private import setting_only
 from workbench.envs.snapshots.cpu_state import renew_physics
 from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 
@@ -100,6 +102,30 @@ def test_the_envs_gravity_and_the_processs_default_are_kept() -> None:
     assert np.allclose(physx.get_scene_config().gravity, other.scene.px.systems[0].config.gravity)
     light.close()
     other.close()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+def test_an_env_from_which_bodies_were_removed_keeps_its_scene_and_is_restored() -> None:
+    env: Any = batched(Written, 3, obs_mode="none", reward_mode="none")
+    env.reset(seed=0)
+    with setting_only(env, [1]):
+        env.lies.remove_from_scene()
+    env.step(None)
+    snapshot, systems = take_snapshot(env), list(env.scene.px.systems)
+    before = env.falls.pose.raw_pose.clone()
+    for _ in range(2):
+        env.step(None)
+    report = restore_snapshot(env, snapshot)
+    assert [name for name in report.not_carried if name.startswith("fresh physics")] == [
+        "fresh physics of env 1"
+    ]
+    assert [new is old for new, old in zip(env.scene.px.systems, systems, strict=True)] == [
+        False,
+        True,
+        False,
+    ]
+    assert torch.allclose(env.falls.pose.raw_pose, before, atol=1e-6)
+    env.close()
 
 
 class Leash(PICK_CUBE):
