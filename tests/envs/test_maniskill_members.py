@@ -20,13 +20,16 @@ from mani_skill.utils import sapien_utils
 from tests.drive.envs import PICK_CUBE, batched
 from tests.envs.watched import RENDERED, Watched
 from tests.envs.written import Written
+from workbench.envs import backends
 from workbench.envs import maniskill_private as private
 from workbench.envs.backends import sapien_device
 from workbench.envs.camera_data import CallSite
 from workbench.envs.error_notes import RefusedCall
 from workbench.envs.rendering.camera_shader import is_ray_traced, replaced_shader
 from workbench.envs.rendering.drawing import CannotDraw, drawing, read_texture
+from workbench.envs.simulation.drawn_poses import camera_pose, drawn_at, temporarily
 from workbench.envs.simulation.strict_system import envs_named
+from workbench.envs.task_env import TaskEnv
 
 N = 3
 
@@ -244,3 +247,61 @@ def test_a_refused_hiding_leaves_the_actor_and_a_translucent_one_returns_as_it_w
         body.visibility = 1.0
     with pytest.raises(RefusedCall):
         watched.wall[0].hide_visual()
+
+
+def test_attributes_return_to_what_they_were_in_any_order_of_changes() -> None:
+    owner = SimpleNamespace(x=1, y=2)
+    with pytest.raises(ZeroDivisionError), temporarily([(owner, "x", 5), (owner, "y", 6), (owner, "x", 7)]):
+        assert (owner.x, owner.y) == (7, 6)
+        raise ZeroDivisionError
+    with pytest.raises(AttributeError), temporarily([(owner, "x", 5), (owner, "nothing", 6)]):
+        raise AssertionError
+    assert (owner.x, owner.y) == (1, 2)
+
+
+def test_a_camera_of_a_body_that_is_drawn_elsewhere_is_moved_with_it(watched: Any) -> None:
+    """And back; the body itself stays."""
+    on_actor, beside = (
+        private.camera_components(watched.scene.sensors[name])[1] for name in ("on_actor", "beside")
+    )
+    entity = watched.rider._objs[1]
+    was = [camera_pose(one, {}) for one in (on_actor, beside)]
+    place = sapien.Pose([1, 2, 3], [0.7071068, 0, 0, 0.7071068])
+    places = {id(entity): (entity, np.array([*place.p, *place.q], np.float32))}
+    wanted = place * on_actor.local_pose
+    for _ in range(2):
+        with drawn_at(places, [on_actor, beside]) as move_bodies:
+            move_bodies()
+            np.testing.assert_allclose(on_actor.get_global_pose().p, wanted.p, atol=1e-5)
+            np.testing.assert_allclose(beside.get_global_pose().p, was[1].p)
+            np.testing.assert_allclose(entity.pose.p, was[0].p, atol=1e-6)
+        np.testing.assert_allclose(on_actor.get_global_pose().p, was[0].p, atol=1e-6)
+    np.testing.assert_allclose(camera_pose(on_actor, places).p, wanted.p, atol=1e-5)
+    np.testing.assert_allclose(camera_pose(beside, places).p, was[1].p)
+
+
+REPORT = """
+GPU: NVIDIA none
+  Supported: 0
+GPU: llvmpipe (LLVM 15)
+  Supported: 1
+GPU: another
+  Supported: 1
+"""
+
+
+def test_the_renderer_is_named_by_the_first_device_that_is_supported(
+    renderer: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for report, name in ((REPORT, "llvmpipe (LLVM 15)"), ("", "unknown device")):
+        monkeypatch.setattr(sapien.render, "get_device_summary", lambda report=report: report)
+        found = backends.find_renderer.__wrapped__()
+        assert found is not None and found.name == name
+
+
+@pytest.mark.parametrize(
+    ("mode", "pictures"),
+    [("state", False), ("state_dict", False), ("none", False), ("rgb", True), ("depth+state", True)],
+)
+def test_a_mode_of_observation_has_pictures_or_not(mode: str, pictures: bool) -> None:
+    assert TaskEnv(SimpleNamespace(obs_mode=mode)).observes_pictures == pictures

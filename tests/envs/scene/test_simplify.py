@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from workbench.envs.scene.normals import with_normals
 from workbench.envs.scene.shapes import Mesh
-from workbench.envs.scene.simplify import flat_rectangle, reduce_mesh
+from workbench.envs.scene.simplify import cluster_mesh, flat_rectangle, reduce_mesh, rounded, share_vertices
 
 
 def soup(mesh: trimesh.Trimesh) -> Mesh:
@@ -115,3 +116,61 @@ def test_only_plain_rectangles_become_two_triangles() -> None:
     swirled.uvs[7] += 0.2
     assert flat_rectangle(swirled) is None
     assert flat_rectangle(soup(trimesh.creation.box())) is None
+
+
+def test_vertices_are_shared_where_place_normal_and_texture_agree() -> None:
+    up, tilted = [0.0, 0.0, 1.0], [0.0, np.sin(0.1), np.cos(0.1)]
+    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]] * 4, np.float32)
+    normals = np.array([up] * 9 + [tilted] * 3, np.float32)
+    uvs = np.array(
+        [[0, 0], [1, 0], [0, 1]] * 2 + [[0.5, 0], [1, 0], [0, 1]] + [[0, 0], [1, 0], [0, 1]], np.float32
+    )
+    faces = np.arange(12, dtype=np.uint32).reshape(-1, 3)
+    shared = share_vertices(Mesh(places, faces, normals, uvs))
+    assert len(shared.vertices) == 3 + 1 + 3, "one other corner in the texture, three other normals"
+    assert shared.normals is not None and shared.uvs is not None
+    for now, was in ((shared.vertices, places), (shared.normals, normals), (shared.uvs, uvs)):
+        np.testing.assert_array_equal(now[shared.faces], was[faces])
+    assert len(share_vertices(Mesh(places, faces)).vertices) == 3
+
+
+def test_normals_are_sharp_at_the_edges_of_a_box_and_keep_the_texture() -> None:
+    box = trimesh.creation.box((1, 2, 3))
+    uvs = np.arange(16, dtype=np.float32).reshape(8, 2)
+    made = with_normals(Mesh(np.asarray(box.vertices, np.float32), np.asarray(box.faces, np.uint32), uvs=uvs))
+    assert len(made.vertices) == 24 and made.normals is not None and made.uvs is not None
+    np.testing.assert_allclose(made.normals[made.faces[:, 0]], box.face_normals, atol=1e-6)
+    np.testing.assert_allclose(made.normals[made.faces[:, 2]], box.face_normals, atol=1e-6)
+    np.testing.assert_array_equal(made.vertices[made.faces], box.vertices[box.faces].astype(np.float32))
+    np.testing.assert_array_equal(made.uvs[made.faces], uvs[box.faces])
+
+
+@pytest.mark.parametrize("size", [0.003, 40.0])
+def test_rounding_moves_little_and_keeps_a_flat_axis(size: float) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=size)
+    points = np.asarray(ball.vertices, np.float32)
+    points[:, 2] = 0.1234567
+    mesh = Mesh(points, np.asarray(ball.faces, np.uint32), np.asarray(ball.vertex_normals, np.float32))
+    less = rounded(mesh)
+    off = np.abs(less.vertices - points)
+    assert off[:, 2].max() == 0 and 0 < off.max() <= 2 * size / 4096
+    assert less.normals is not None and mesh.normals is not None
+    agreement = (less.normals * mesh.normals).sum(axis=1) / np.linalg.norm(less.normals, axis=1)
+    assert agreement.min() > np.cos(np.deg2rad(1.5)) and len(np.unique(less.normals)) < len(
+        np.unique(mesh.normals)
+    )
+
+
+def test_pieces_in_one_cell_of_a_grid_grow_together() -> None:
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.01) for _ in range(6)]
+    for number, ball in enumerate(balls):
+        ball.apply_translation((0.2 * (number % 2), 0.2 * (number // 2 % 2), 0.2 * (number // 4)))
+    whole = trimesh.util.concatenate(balls)
+    mesh = Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32))  # type: ignore[union-attr]
+    fine, coarse = cluster_mesh(mesh, 10_000, 200), cluster_mesh(mesh, 10_000, 24)
+    assert len(mesh.faces) >= len(fine.faces) > 3 * len(coarse.faces) > 0
+    for made, cells in ((fine, 200), (coarse, 24)):
+        distance, _ = KDTree(mesh.vertices).query(made.vertices)
+        assert np.max(distance) < 0.22 / cells
+    assert len(cluster_mesh(mesh, 40, 200).faces) < 0.5 * len(fine.faces)
+    assert cluster_mesh(mesh, 40, 1) is mesh, "nothing would be left"

@@ -76,6 +76,14 @@ def test_a_pose_with_nan_is_refused_with_the_name_of_the_body(pick_cubes: BaseEn
         pick_cubes.set_state_dict(state)
     pick_cubes.scene._needs_fetch = False
     pick_cubes.scene._gpu_fetch_all()
+    px, rows = pick_cubes.scene.px, pick_cubes.cube._body_data_index
+    before = px.cuda_rigid_body_data.torch().clone()
+    px.cuda_rigid_body_data.torch()[rows[[0, 2]], 0] = torch.tensor([0.3, float("inf")])
+    with pytest.raises(ValueError, match="cube of env 2"):
+        px.gpu_apply_rigid_dynamic_data()
+    px.gpu_apply_rigid_dynamic_data()  # what was refused is gone, and does not raise again
+    px.gpu_fetch_rigid_dynamic_data()
+    assert torch.equal(px.cuda_rigid_body_data.torch()[rows[1:]], before[rows[1:]])
 
 
 @pytest.mark.filterwarnings("ignore:PhysxRigidDynamicComponent")
