@@ -467,6 +467,17 @@ class OnlyDense(Bare):
         return torch.ones(self.num_envs)
 
 
+def test_a_task_without_a_robot_takes_no_action() -> None:
+    task = TaskEnv(make_env(OnlyDense, EnvOptions(2, "cpu", render=False)))
+    task.reset(seed=0)
+    assert task.parts == () and actions.hold_action(task.parts, 2).shape == (2, 0)
+    for action in (None, np.zeros((2, 0), np.float32), np.ones((2, 3), np.float32)):
+        step = task.step(action)
+        assert step.action is None and step.reward.tolist() == [1.0, 1.0]
+    assert task.rescore(np.zeros((2, 0), np.float32)).reward.tolist() == [1.0, 1.0]
+    task.close()
+
+
 def test_given_arguments_override_registered_ones_and_those_the_default_reward() -> None:
     def made(registered: dict | None, **named: object) -> Any:
         env = make_env(OnlyDense, EnvOptions(2, "cpu", render=False, kwargs=named), default_kwargs=registered)

@@ -128,6 +128,19 @@ def test_an_env_from_which_bodies_were_removed_keeps_its_scene_and_is_restored()
     env.close()
 
 
+def test_a_reset_that_begins_anew_renews_the_envs_that_it_resets() -> None:
+    env: Any = batched(PICK_CUBE, 3)
+    for begins_anew in (True, False):
+        env.begins_anew = begins_anew
+        for chosen in ([1], [0, 2], None):
+            systems = list(env.scene.px.systems)
+            env.reset(options={} if chosen is None else {"env_idx": torch.tensor(chosen)})
+            renewed = [k for k, old in enumerate(systems) if env.scene.px.systems[k] is not old]
+            assert renewed == ((chosen or [0, 1, 2]) if begins_anew else [])
+            env.step(None)
+    env.close()
+
+
 class Leash(PICK_CUBE):
     """A ball that a drive holds in mid-air."""
 
