@@ -52,6 +52,7 @@ def test_the_worst_body_is_named_with_its_value() -> None:
     moved[1, 2, 1] += 1.5
     moved[1, 3, 0] -= 2.0
     moved[0, :2, 0] += 9.0  # the ground and a kinematic body are no outliers
+    moved[0, 1, 2] = -9.0
     [sight] = watch.check(step_of(moved))
     assert (sight.kind, sight.reason(1)) == (OutlierKind.FAST, "cube moved at 40 m/s")
     assert sight.body is not None and sight.body(1) == "cube"
