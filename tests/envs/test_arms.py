@@ -1,5 +1,8 @@
 """Arms of ManiSkill's robots: found, solved within their limits, and led by the action in one env."""
 
+# SAPIEN and ManiSkill annotate vectors and poses as what they become.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import copy

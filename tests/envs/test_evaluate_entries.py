@@ -217,7 +217,7 @@ def test_a_reward_is_floats_with_a_row_for_each_env(
         ({"fail": EACH > 1, "success": (EACH > 1).int()}, N, False, True),
         ({"success": torch.zeros(N, 1, dtype=torch.bool)}, N, True, False),
         ({"fail": True}, N, True, False),
-        ({"fail": EACH.cfloat()}, N, True, True),
+        ({"fail": EACH.to(torch.complex64)}, N, True, True),
         ({"fail": None}, N, True, False),
         ({"success": torch.tensor(True)}, 1, False, False),
         ({"success": torch.tensor([[True]])}, 1, False, True),

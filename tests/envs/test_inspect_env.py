@@ -2,7 +2,7 @@
 
 # ManiSkill annotates an env's members as the widest thing they may be.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
-# pyright: reportOptionalIterable=false, reportOptionalSubscript=false, reportGeneralTypeIssues=false
+# pyright: reportOptionalIterable=false, reportOptionalSubscript=false, reportGeneralTypeIssues=false, reportCallIssue=false
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_an_observation_that_a_task_flattens_in_its_own_way_has_no_names() -> No
     task = made(FlattensItself, obs_mode="state")
     columns = {name: column for name, column in read_state_columns(task).items() if name.startswith("obs/")}
     assert [*columns] == ["obs/"] and columns["obs/"].shape == task.obs.shape
-    [leaf] = inspect_env(task, 2, ["observation"]).observation or ()
+    [leaf] = list(inspect_env(task, 2, ["observation"]).observation or ())
     assert leaf.shape == task.obs.shape[1:] and leaf.high == float(task.obs[2].max())
     task.close()
 

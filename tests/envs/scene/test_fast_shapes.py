@@ -1,7 +1,8 @@
 """Fast pictures of cameras on heavy bodies equal exact ones but for few pixels, in envs that differ."""
 
 # ManiSkill annotates vectors and poses as what they become.
-# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false, reportOperatorIssue=false
+# pyright: reportCallIssue=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 """View culling agrees with the pixels on which the points of boxes and triangles fall."""
 
+# SAPIEN and ManiSkill annotate vectors and poses as what they become.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from typing import Any

@@ -1,5 +1,8 @@
 """The geometry sent to the browser matches what ManiSkill's own renderer draws."""
 
+# SAPIEN and ManiSkill annotate vectors and poses as what they become.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from pathlib import Path

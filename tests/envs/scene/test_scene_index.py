@@ -1,5 +1,8 @@
 """The pose array of all bodies equals the poses of ManiSkill's own structs."""
 
+# SAPIEN and ManiSkill annotate vectors and poses as what they become.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import gc
