@@ -36,7 +36,8 @@ class PlannedEnv(PushCubeEnv):
     def evaluate(self):
         height = self.agent.tcp.pose.p[:, 2]
         fail = height > 0.2 if self.trouble == "fail" else torch.zeros_like(height, dtype=torch.bool)
-        return {"success": height > 5.0, "fail": fail, "height": height}
+        success = height > (0.19 if self.trouble == "fail" else 5.0)
+        return {"success": success, "fail": fail, "height": height}
 
     def compute_dense_reward(self, obs, action, info):
         height = info["height"]
@@ -144,17 +145,22 @@ def test_actions_stay_within_the_space_and_the_gripper_is_open_or_closed(
     assert plan.actions.shape == (4, 7) and plan.rewards.shape == (8, 4)
 
 
-def test_every_sets_how_many_actions_of_a_plan_are_taken(task: Path) -> None:
-    env = workbench.make(task, 1, **MADE)
+def test_every_sets_how_many_actions_of_each_envs_plan_are_taken(task: Path) -> None:
+    env = workbench.make(task, 2, **MADE)
     planner = workbench.Planner(env, every=3, **SMALL)
     env.reset(seed=0)
-    plans = []
-    for _ in range(4):
+    plans, taken = [], [(0, 0), (1, 1), (2, 0), (0, 1)]
+    for turn, numbers in enumerate(taken):
+        if turn == 2:
+            planner.reset(1)  # its episode begins anew
         action = planner.actions()
-        plans.append(planner.plans[0])
-        np.testing.assert_array_equal(action[0].numpy(), planner.plans[0].actions[(len(plans) - 1) % 3])
+        plans.append(dict(planner.plans))
+        for number, at in enumerate(numbers):
+            np.testing.assert_array_equal(action[number].numpy(), planner.plans[number].actions[at])
         env.step(action)
-    assert [plan is plans[0] for plan in plans] == [True, True, True, False]
+    for number, first in enumerate(([True, True, True, False], [True, True, False, False])):
+        assert [each[number] is plans[0][number] for each in plans] == first
+    assert plans[2][1] is plans[3][1]
     planner.close()
     env.close()
 
@@ -177,6 +183,10 @@ def test_a_rollout_earns_nothing_after_a_fail_and_ranks_worst_with_nan(task: Pat
             ended = (plan.rewards == 0).argmax(1)
             for rewards, at in zip(plan.rewards, ended):
                 assert not rewards[at:].any() or at == 0
+            high = plan.rewards > 0.19
+            assert plan.success_at.tolist() == np.where(high.any(1), high.argmax(1) + 1, 0).tolist()
+            assert plan.terms.keys() == {"height", "still"} and not plan.terms["still"].any()
+            np.testing.assert_allclose(plan.terms["height"], plan.returns, rtol=1e-5)
     assert float(info["height"]) < 0.2
     assert troubled
     planner.close()
