@@ -64,3 +64,17 @@ def test_an_undecided_rule_does_not_judge_a_comment() -> None:
     for state in ("failed", "not_known", "not_applicable"):
         assert ineffective(RuleResult("reward-finite", state)) == []
     assert ineffective() == []
+
+
+def test_a_comment_in_a_base_class_of_another_file_is_judged_and_one_of_another_task_there_is_not() -> None:
+    base = """
+class Push(BaseEnv):
+    x = 1  # workbench: off[reward-finite] of all
+
+class Pull(Push):
+    y = 2  # workbench: off[reward-finite] of the other
+"""
+    mine = "from base import Push\n\nclass Mine(base.Push):\n    z = 3  # workbench: off[reward-finite] of mine\n"
+    sources = {"mine.py": mine, "base.py": base, "broken.py": "def (:  # workbench: off[reward-finite] so\n"}
+    found = comments_without_effect(sources, [RuleResult("reward-finite", "kept")], "Mine")
+    assert [(one.file, one.line) for one in found] == [("mine.py", 4), ("base.py", 3)]

@@ -40,8 +40,8 @@ def test_success_after_a_reset_counts_the_seeds_that_have_it(example: Checkup) -
 
 
 def test_each_kind_of_episodes_counts_its_own_successes(example: Checkup) -> None:
-    starts, random = episodes(success="0 0 0"), episodes(success="00000 00010 00000")
-    acted = (episodes(kind="given", seeds=[7, 8], success="0001 0100"),)
+    starts, random = episodes(success="0 0 0"), episodes(success="00000 00110 00000")
+    acted = (episodes(kind="given", seeds=[7, 8], success="0111 0100"),)
     result = outcome(example, "success-stays-possible", starts=starts, random=random, acted=acted)
     assert result.notes == ("success in 1 of 3 random episodes", "success in 2 of 2 given episodes")
     for mode, state in (("sparse", "broken"), ("dense", "not_applicable")):

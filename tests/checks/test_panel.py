@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from workbench.checks.commands import (
 )
 from workbench.checks.panel import AFTER_SAVE, CHECK_NOW, REST, STOP_CHECKS, findings_mark, status_html
 from workbench.checks.profile import ProfileView
-from workbench.checks.profile_panel import PROFILE, STOP_PROFILE
+from workbench.checks.profile_panel import PROFILE, STOP_PROFILE, milliseconds, share_text
 from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile, failed
 from workbench.checks.state import ChecksView
 from workbench.envs.gpu_rules import Finding
@@ -192,6 +193,54 @@ def test_findings_while_playing_are_added_to_and_removed_from_the_same_list(chec
     assert "bodies-stay" not in text and "not-applied" not in text
 
 
+def test_only_the_first_findings_of_a_rule_are_listed_and_all_are_counted(checks: Checks) -> None:
+    many = tuple(replace(FOUND, line=80 + k, code=f"x = {k}") for k in range(7))
+    text = checks.draw(replace(DONE, results=(RuleResult("success-at-reset", "broken", many),)))
+    assert "push.py:84" in text and "push.py:85" not in text and "and 2 more" in text
+    assert checks.tab == "Checks 7" and checks.marked == 7
+    text = checks.draw(replace(DONE, results=(RuleResult("success-at-reset", "broken", many[:5]),)))
+    assert "push.py:84" in text and "more" not in text
+
+
+def test_the_mark_names_the_worst_line_and_says_whether_a_run_stops(checks: Checks) -> None:
+    nowhere = replace(FOUND, file=None, line=None)
+    warned = replace(FOUND, rule="reward-changes", degree="warn", line=12, code="y")
+    broken = RuleResult("reward-changes", "broken", (warned,))
+    for view, expected in (
+        (
+            replace(DONE, results=(broken, RuleResult("success-at-reset", "broken", (nowhere,)))),
+            (2, "push.py:12 and 1 more", True, False),
+        ),
+        (replace(DONE, results=(broken,)), (1, "push.py:12", False, False)),
+        (ChecksView("checking", before=(warned, FOUND)), (2, "push.py:88 and 1 more", True, True)),
+        (
+            ChecksView("checking", before=(FOUND,), results=(broken,)),
+            (2, "push.py:12 and 1 more", True, False),
+        ),
+        (
+            replace(DONE, results=(RuleResult("success-at-reset", "broken", (nowhere,)),)),
+            (1, "", True, False),
+        ),
+    ):
+        mark = findings_mark(running(1, checks=view))
+        assert mark is not None and (mark.count, mark.newest, mark.stops, mark.old) == expected
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.5, "50 %"), (0.012, "1 %"), (0.01, "1 %"), (0.0094, "0.9 %"), (0.0, "0.0 %")]
+)
+def test_a_small_share_of_a_step_is_more_than_none(share: float, text: str) -> None:
+    assert share_text(share) == text
+
+
+@pytest.mark.parametrize(
+    ("time", "text"),
+    [(123.4, "123 ms"), (10.0, "10 ms"), (9.94, "9.9 ms"), (1.0, "1.0 ms"), (0.034, "0.034 ms")],
+)
+def test_times_of_a_step_have_two_digits(time: float, text: str) -> None:
+    assert milliseconds(time) == text
+
+
 PROFILED = StepProfile(
     64,
     200,
@@ -223,7 +272,11 @@ def test_a_step_profile_is_requested_and_shown_by_hook_and_line(checks: Checks) 
     ):
         assert words in text
     assert "push.py:94" not in text, "lines that take almost no time are left out"
-    checks.draw(profile=ProfileView("failed", 3, why="no agent"))
+    assert [int(width) for width in re.findall(r"width: (\d+)", text)] == [50, 25, 35, 0, 0, 0, 0]
+    assert "previous" not in text
+    checks.draw(profile=ProfileView("stopped", 3, PROFILED, stale=True))
+    assert "previous" in checks.live.html()
+    checks.draw(profile=ProfileView("failed", 4, why="no agent"))
     assert "no agent" in checks.live.html() and not checks.live.html("wb-profile")
 
 

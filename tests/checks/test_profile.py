@@ -68,7 +68,10 @@ def test_a_load_and_the_stop_button_end_a_profile(fake: FakeWorkerSession, timer
     for end in (lambda: fake.load("patched"), lambda: fake.session.do(StopProfile())):
         fake.session.do(TimeStep())
         end()
-        assert fake.view.of(ProfileView).state == "stopped"
+        assert fake.view.of(ProfileView).state == "stopped" and fake.view.of(ProfileView).profile is None
+    timer.let = True
+    fake.session.do(TimeStep())
+    until(lambda: fake.view.of(ProfileView).state == "done", "the profile after a stop")
 
 
 def test_an_error_of_the_task_is_shown(fake: FakeWorkerSession, timer: Timer) -> None:
@@ -76,4 +79,11 @@ def test_an_error_of_the_task_is_shown(fake: FakeWorkerSession, timer: Timer) ->
     timer.let, timer.fails = True, JobFailed("it cannot be timed", problem())
     fake.session.do(TimeStep())
     until(lambda: fake.view.of(ProfileView).state == "failed", "the failure")
-    assert fake.view.of(ProfileView).problem == problem()
+    assert fake.view.of(ProfileView).problem == problem() and fake.view.of(ProfileView).why
+    # The next one does not show the old error.
+    timer.let, timer.fails = False, None
+    fake.session.do(TimeStep())
+    view = fake.view.of(ProfileView)
+    assert (view.state, view.problem, view.why) == ("running", None, "")
+    timer.let = True
+    until(lambda: fake.view.of(ProfileView).state == "done", "the profile")

@@ -5,23 +5,27 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.drive.scenes import description, problem, table_scene
 from tests.drive.session import FakeWorkerSession, fake_worker_session, live_session, wait_until, work_with
 from tests.drive.waiting import until
+from workbench.checks import state
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks
 from workbench.checks.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.checks.results import RuleResult
-from workbench.checks.state import RUNNING, ChecksView
-from workbench.envs.gpu_rules import Finding
+from workbench.checks.state import MAX_DEATHS, RUNNING, ChecksView
+from workbench.envs.gpu_rules import GPU_RULES, Finding
 from workbench.live.commands import PlayRun
-from workbench.live.events import FileSaved
-from workbench.live.messages import Load
+from workbench.live.events import FileSaved, LoadDone
+from workbench.live.messages import Load, Settings
 from workbench.live.process.ask import Preempted
 from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied, StoppedBy
+from workbench.live.run import first_run
 from workbench.machine.kept_choices import kept_choices
 from workbench.page.command import Refused
 from workbench.record.saving_state import SaveWanted
@@ -54,8 +58,9 @@ class ScriptedBackground:
         self.loads: list[Load] = []
         self.give_way_after = 99
         """Number of results of a group after which a job of higher priority preempts it, once."""
-        self.dies_at = ""
-        """The rule that kills the process."""
+        self.groups: tuple[tuple[str, ...], ...] = GROUPS
+        self.dies_at: str | None = None
+        """The rule that kills the process; ``any`` if it dies before the first one."""
         self.fails: JobFailed | None = None
         self.let = threading.Semaphore(1000)
 
@@ -78,7 +83,9 @@ class ScriptedBackground:
 
     async def ask(self, question: CheckGroup, on_progress: Callable[..., None]) -> CheckedGroup:
         self.asked.append(question)
-        for done, rule in enumerate(GROUPS[question.group], 1):
+        if self.dies_at == "any":
+            raise ProcessDied("the process in the background was killed by SIGSEGV")
+        for done, rule in enumerate(self.groups[question.group], 1):
             while not self.let.acquire(blocking=False):
                 await asyncio.sleep(0.005)
             if rule not in question.known:
@@ -262,9 +269,10 @@ def test_without_automatic_checks_a_load_marks_the_findings_as_old(
     load(checks)
     ended(checks)
     checks.session.do(CheckAfterSave(on=False))
-    load(checks, NEXT_TEXT)
-    view = checks.view.of(ChecksView)
-    assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
+    for text in (NEXT_TEXT, NEXT_TEXT + "\n"):
+        load(checks, text)
+        view = checks.view.of(ChecksView)
+        assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
     assert len(background.asked) == 2
 
 
@@ -290,6 +298,108 @@ def test_a_check_stopped_by_hand_says_so(checks: FakeWorkerSession, background: 
     assert (view.state, view.stopped_by) == ("stopped", StoppedBy.HAND)
     checks.session.do(StopChecks())
     assert checks.view.of(ChecksView) == view
+
+
+def test_rules_of_gpu_simulation_that_kill_the_process_fail_together(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
+    background.groups, background.dies_at = ((FIRST,), ("",)), ""
+    load(checks)
+    view = ended(checks)
+    states = {result.rule: result.state for result in view.results}
+    assert view.state == "done" and states == {FIRST: "kept"} | dict.fromkeys(GPU_RULES, "failed")
+    assert [question.group for question in background.asked] == [0, 1]
+
+
+def test_a_process_that_dies_again_and_again_ends_the_check_and_the_next_check_begins_anew(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
+    background.dies_at = "any"
+    load(checks)
+    view = ended(checks)
+    assert view.state == "failed" and "SIGSEGV" in view.why and len(background.asked) == MAX_DEATHS + 1
+    background.dies_at = None
+    background.fails = JobFailed("it cannot be loaded", problem())
+    checks.session.do(CheckNow())
+    view = ended(checks)
+    assert view.state == "failed" and view.problem == problem() and "SIGSEGV" not in view.why
+    background.fails = None
+    checks.session.do(CheckNow())
+    view = ended(checks)
+    assert (view.state, view.why, view.problem, view.stopped_by) == ("done", "", None, None)
+
+
+def test_a_version_of_which_no_rule_is_checked_shows_no_finding(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
+    background.comes_to = {FIRST: broken(FIRST)}
+    load(checks)
+    ended(checks)
+    load(checks, options=TaskOptions(3, rules="off"))
+    view = checks.view.of(ChecksView)
+    assert (view.state, view.before, view.results) == ("off", (), ()) and len(background.asked) == 2
+
+
+@pytest.mark.parametrize(
+    "changes", [{"file": None, "line": None, "code": ""}, {"code": ""}, {"file": "/home/me/other.py"}]
+)
+def test_a_finding_whose_line_is_not_known_stays_until_its_rule_is_checked(
+    changes: dict[str, Any], checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
+    one = replace(finding(FIRST), **changes)
+    background.comes_to = {FIRST: RuleResult(FIRST, "broken", (one,))}
+    load(checks)
+    ended(checks)
+    background.hold()
+    load(checks, MENDED_TEXT)
+    assert checks.view.of(ChecksView).before == (one,)
+
+
+@pytest.mark.parametrize(("ahead", "priorities"), [(1e9, ["low", "low"]), (0.0, ["low", "lowest"])])
+def test_a_long_check_goes_on_behind_all_other_work(
+    ahead: float,
+    priorities: list[str],
+    checks: FakeWorkerSession,
+    background: ScriptedBackground,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("workbench.checks.state.AHEAD_SECONDS", ahead)
+    load(checks)
+    ended(checks)
+    assert background.priorities == priorities
+
+
+def test_the_page_sees_how_far_a_check_is_and_what_it_waits_for() -> None:
+    run = replace(first_run("push.py", TaskOptions(1), 1, Settings()), task=description(table_scene(1)[0]))
+    now, _ = state.apply(
+        state.Checks(ChecksView(before=(finding(FIRST), finding(SECOND)))), LoadDone(), run, run
+    )
+
+    def seen(event: object) -> ChecksView:
+        nonlocal now
+        now, effects = state.apply(now, event, run, run)
+        assert effects == []
+        return now.view
+
+    assert (now.view.state, len(now.view.before), now.view.total) == ("loading", 2, 0)
+    assert seen(state.CheckWaits(True)).waits
+    view = seen(state.GroupBegan())
+    assert (view.state, view.waits) == ("checking", False)
+    view = seen(state.RuleChecked(broken(FIRST), 1.5, 58))
+    assert (view.total, view.seconds, rules_of(view)) == (58, 1.5, [FIRST])
+    assert [one.rule for one in view.before] == [SECOND]
+    view = seen(state.GroupChecked(58, "rewards"))
+    assert view.looks_at == "rewards"
+    view = seen(state.RuleChecked(RuleResult(FIRST, "kept"), 2.5))
+    assert (view.total, view.seconds) == (58, 2.5), (
+        "of the process that died the number of rules is not known"
+    )
+    (result,) = view.results
+    assert result.state == "broken", "another rule may find that the task raises, which breaks the same rule"
+    assert seen(state.CheckWaits(True)).waits
+    view = seen(state.CheckDone())
+    assert (view.state, view.looks_at, view.waits, view.before) == ("done", "", False, ())
+    assert seen(state.RuleChecked(broken(SECOND), 9.0, 9)) is view, "it came late"
 
 
 # --- with processes -----------------------------------------------------------------------------------
