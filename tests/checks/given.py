@@ -47,7 +47,8 @@ def outcome(
     looks = {odd_states: odd or OddStates()}
     if mode:
         vars(given)["task"] = SimpleNamespace(env=SimpleNamespace(reward_mode=mode))
-    vars(given).update(evidence, failed={}, look=lambda see: looks[see] if see in looks else see(given))
+    vars(given).update(failed={}, look=lambda see: looks[see] if see in looks else see(given))
+    vars(given).update(evidence)
     return run.check_rule(rule, CHECKS[rule], given, degree_of_each())[0]
 
 

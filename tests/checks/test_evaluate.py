@@ -83,27 +83,6 @@ def test_a_breach_that_was_found_before_a_policy_raised_counts(checked: Checked)
     assert result.problem is not None and result.problem.message == "no such joint"
 
 
-def test_success_and_fail_together(checked: Checked) -> None:
-    edits = (
-        ('"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)'),
-        ("height < -0.1", "height < 1"),
-    )
-    assert "`success & ~fail`" in the_finding(checked("success-and-fail", *edits)).message
-    result = checked("success-and-fail")
-    assert (result.state, result.why) == ("not_known", "no tried episode succeeds")
-    seldom = '"success": (distance < 1) & (self.elapsed_steps > 4)', '"fail": self.elapsed_steps < 3,'
-    edits = (('"success": (distance < GOAL_RADIUS)', seldom[0]), ('"fail": height < -0.1,', seldom[1]))
-    assert checked("success-and-fail", *edits).state == "kept"
-
-
-def test_success_that_is_true_for_a_single_step_at_a_time(checked: Checked) -> None:
-    flickers = '"success": (distance < 1) & (self.elapsed_steps % 2 == 1)'
-    finding = the_finding(checked("success-flickers", ('"success": (distance < GOAL_RADIUS)', flickers)))
-    assert "single step" in finding.message
-    lasts = '"success": (distance < 1) & (self.elapsed_steps > 2)'
-    assert checked("success-flickers", ('"success": (distance < GOAL_RADIUS)', lasts)).state == "kept"
-
-
 def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:
     easy = '"success": (distance < 1) & (height.abs() < 0.005),'
     edit = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'

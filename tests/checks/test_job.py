@@ -111,6 +111,44 @@ def test_an_undecided_rule_is_no_success(tmp_path: Path) -> None:
     assert report.findings == () and report.fails("stop")
 
 
+def test_seeds_begin_at_the_requested_one_in_all_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.checks.job_items.SEEDS_OF_PART", 4)
+    made, steps = TaskOptions(num_envs=4, env_kwargs=PLAIN, seed=50), list[int]()
+    task = task_of(tmp_path, AT_ONCE, LOSES_ROWS)
+    what = CheckOptions(
+        task, made, seeds=6, select=("success-at-reset", "outside-reach", "rows-lost"), workers=1
+    )
+    seen: list[str] = []
+    report = check(what, seen.append, on_progress=steps.append)
+    (success,) = [one for one in report.findings if one.rule == "success-at-reset"]
+    assert success.count == 6 and "6 of 6 seeds (seed 50, 51, 52, 53, 54 ...)" in success.message
+    assert states(report) == {"rows-lost": "broken", "success-at-reset": "broken", "outside-reach": "kept"}
+    assert steps == [1, 2, 3, 4, 5] and any("part 2 of 2" in text for text in seen)
+    assert (
+        report.task.source == {task: Path(task).read_text()} and report.task.env_id == "WorkbenchPushCube-v1"
+    )
+
+
+def test_a_policy_acts_in_an_episode_of_each_seed_and_its_error_is_not_the_tasks(tmp_path: Path) -> None:
+    short = "max_episode_steps=50", "max_episode_steps=22"
+    task, policy = task_of(tmp_path, TURNED, short), tmp_path / "policy.py"
+    act = "def act(obs):\n    import torch\n    action = torch.zeros((len(obs), 8))\n    action[:, 0] = 1\n    return action\n"
+    policy.write_text(act)
+    what = replace(options(task, "success-stays-possible", "runs"), actions=f"{policy}:act")
+    report = check(what)
+    assert notes(report)["success-stays-possible"][1:] == ("success in 4 of 4 given episodes",)
+    policy.write_text(act.replace("= 1", "= gone"))
+    report = check(what)
+    (result,) = report.of_state("not_known")
+    assert (
+        result.rule == "success-stays-possible" and "gone" in result.why and states(report)["runs"] == "kept"
+    )
+    with pytest.raises(TaskError):
+        check(replace(what, actions=f"{policy}:gone"))
+
+
 def test_a_stopped_job_returns_its_results_so_far(tmp_path: Path) -> None:
     seen: list[RuleResult] = []
     rules = "success-at-reset", "reward-finite"

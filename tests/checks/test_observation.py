@@ -42,11 +42,6 @@ def test_the_line_of_a_finding_writes_the_entry_and_does_not_only_read_it(checke
     assert the_finding(checked("observation-constant", edit)).code == write
 
 
-def test_an_observation_in_millimetres(checked: Checked) -> None:
-    finding = the_finding(checked("observation-huge", (GOAL, '"goal_pos": self.goal.pose.p * 1e6,')))
-    assert "'extra/goal_pos'" in finding.message and finding.code.startswith('"goal_pos"')
-
-
 def test_ground_truth_in_a_mode_with_pictures(checked: Checked, renderer: None) -> None:
     edit = GOAL, f'{GOAL} "cube_from_tcp": self.cube.pose.p - self.agent.tcp.pose.p,'
     finding = the_finding(checked("ground-truth", edit))

@@ -60,9 +60,11 @@ def lines(place: str, *statements: str) -> tuple[str, str]:
 
 
 def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
+    (tmp_path / "lid.glb").write_bytes(b"")
     results = source_results(
         tmp_path,
         IMPORTS,
+        ("    agent: Panda | Fetch\n", '    agent: Panda | Fetch\n    POT = "pot.glb"\n'),
         (REGISTERED, '@register_env("WorkbenchPushCube")'),
         ('SUPPORTED_ROBOTS = ["panda", "fetch"]', 'SUPPORTED_ROBOTS = ["fetch"]'),
         ('"normalized_dense", ', '"normalised_dense", '),
@@ -76,6 +78,11 @@ def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
             f'{NEVER}builder.add_visual_from_file("cup.glb")',
             'x = str(Path(__file__).parent / "mug.glb")',
             'x = os.path.join(os.path.dirname(__file__), f"{MESH}.obj")',
+            'x = Path(__file__).resolve().parents[0].joinpath("jug.glb")',
+            'name = "pan" + ".glb"',
+            f"{NEVER}builder.add_visual_from_file(filename=name)",
+            "x = Path(__file__).parent / self.POT",
+            f'{NEVER}builder.add_visual_from_file("lid.glb")',
             'self.models = ASSET_DIR / "assets/mani_skill2_ycb/info_pick_v0.json"',
         ),
         lines(
@@ -127,7 +134,14 @@ def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
         "self.cube._objs[0].pose": False,
     }
     missing = [finding.message for finding in results["missing-file"].findings]
-    assert all(any(name in one for one in missing) for name in ("cup.glb", "/mug.glb", "/bowl.obj")), missing
+    for name in ("cup.glb", "/mug.glb", "/bowl.obj", "/jug.glb", "pan.glb", "/pot.glb"):
+        assert any(f"{name}." in one for one in missing), name
+    # A file beside the task's is there only for who starts in its folder.
+    assert (
+        "Path(__file__).parent / 'lid.glb'"
+        in findings_by_code("missing-file")['builder.add_visual_from_file("lid.glb")'].message
+    )
+    assert len(missing) == 7
     assert {finding.degree for finding in results["missing-file"].findings} == {"stop"}
     assert "asset_download_ids=['ycb']" in next(iter(findings_by_code("undeclared-assets").values())).message
 
@@ -153,14 +167,40 @@ def test_code_that_only_looks_like_a_mistake_is_not_reported(tmp_path: Path) -> 
             'x = Path(__file__).parent / "cup.glb"',
             f'{NEVER}open("log.csv", "w")',
             'self.models = ASSET_DIR / "assets/mani_skill2_ycb/info_pick_v0.json"',
+            'x = 3 if self.num_envs < 99 else ASSET_DIR / "tasks/partnet_mobility/dataset/1.urdf"',
         ),
         lines(
             EVALUATE,
             "if self.gpu_sim_enabled: self.scene._gpu_apply_all()",
+            "self.gpu_sim_enabled and self.scene._gpu_fetch_all()",
+            "x = None if not self.gpu_sim_enabled else self.scene._gpu_fetch_all()",
+            "if self.num_envs > 99: self.on_gpu(), self.on_gpu_only()",
+        ),
+        (
+            "    def evaluate(self)",
+            "    def on_gpu(self):\n        if not self.gpu_sim_enabled:\n            return\n        self.scene._gpu_apply_all()\n\n"
+            "    def on_gpu_only(self):\n        assert self.gpu_sim_enabled\n        self.scene._gpu_apply_all()\n\n"
+            "    def evaluate(self)",
         ),
         ("\n\n@register_env", "\ndef try_out():\n    return np.random.rand()\n\n\n@register_env"),
     )
     assert {rule: result.findings for rule, result in results.items() if result.findings} == {}
+
+
+def test_a_call_after_a_guard_that_ends_nothing_is_reported(tmp_path: Path) -> None:
+    guard = "    def on_gpu(self):\n        if not self.gpu_sim_enabled:\n            pass\n        self.scene._gpu_apply_all()\n\n"
+    results = source_results(
+        tmp_path,
+        ("    def evaluate(self)", f"{guard}    def evaluate(self)"),
+        lines(EVALUATE, f"{NEVER}self.on_gpu()"),
+        (
+            "    def compute_normalized_dense_reward",
+            "    def get_reward(self, **k): ...\n\n    def compute_normalized",
+        ),
+        ('"normalized_dense", ', '"normalised_dense", '),
+    )
+    finding = the_finding(results["backend-only-call"])
+    assert finding.function == "on_gpu" and results["reward-modes"].state == "not_applicable"
 
 
 def test_a_class_without_an_id_and_with_another_tasks_id(checked: Checked) -> None:

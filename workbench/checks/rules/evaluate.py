@@ -326,18 +326,15 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts. Also a row for each entry of ``evaluate()`` that is not finite, for
-    the first kind of rollouts in which this happens."""
-    reported: set[str] = set()
+    """A row for each kind of rollouts, and a row for each entry of ``evaluate()`` that is not finite there."""
     for episodes in checkup.rollouts:
         numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))
         yield Seen((episodes.kind,), tried=len(episodes.seeds), numbers=(numbers,) if numbers else ())
         for name, rows in episodes.evaluate.items():
-            if rows.dtype.kind != "f" or name in reported:
+            if rows.dtype.kind != "f":
                 continue
             bad = np.logical_or.reduce(~np.isfinite(rows.reshape(*rows.shape[:2], -1)), axis=2)
             if bad.any():
-                reported.add(name)
                 place = checkup.places.entry(name.rpartition("/")[2])
                 yield _seen_at(bad, episodes, (episodes.kind, name), place)
 
