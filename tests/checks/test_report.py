@@ -216,6 +216,24 @@ def test_a_policy_that_cannot_be_imported_ends_the_check() -> None:
     assert raised.value.problem == problem
 
 
+def test_envs_are_made_as_for_the_given_actions_unless_the_request_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = {"control_mode": "pd_joint_pos", "size": 2}
+    monkeypatch.setattr("workbench.checks.job.find_actions", lambda actions, task: ([], given))
+    asked: list[CheckOptions] = []
+
+    class Notes(Dies):
+        def run(self, work: Work, scheduler: Scheduler[Any, Any]) -> None:
+            asked.append(work.setup)
+            super().run(work, scheduler)
+
+    what = options(select=("body-names",), workers=3)
+    what = replace(what, options=replace(what.options, env_kwargs={"size": 3}))
+    check(what, executor=Notes(what, ""))
+    assert asked == [replace(what, options=replace(what.options, env_kwargs={**given, "size": 3}))]
+
+
 def test_progress_is_counted_in_items_with_several_parts_only() -> None:
     for seeds, expected in ((4, []), (40, [1, 2, 3, 4])):
         what = options(seeds, num_envs=8, select=("success-at-reset", "outside-reach"))

@@ -185,6 +185,17 @@ def test_an_episode_without_a_step_says_nothing() -> None:
     assert rules(rises(0), replace(unsolved(0.4), **none)) == []
 
 
+@pytest.mark.parametrize(("steps", "counted"), [(8, 4), (20, 10), (1, 1)])
+def test_at_most_the_last_half_of_an_episode_is_its_end(steps: int, counted: int) -> None:
+    reward = np.zeros(steps, np.float32)
+    reward[-counted:] = 1.0
+    best = 10 * reward
+    one = PlannedEpisode(9, HORIZON, reward, reward < 0, reward < 0, best + 1, best, best - 1)
+    assert rules(rises(0), one) == ["reward-exploited"]
+    reward[-counted] = 0.9
+    assert rules(rises(0), one) == []
+
+
 def test_a_fall_counts_from_a_quarter_of_the_rise_on() -> None:
     def dips(depth: float, start: float = 0.0) -> PlannedEpisode:
         one = rises(5)
