@@ -164,6 +164,94 @@ def test_draws_depend_only_on_the_seed() -> None:
     assert not torch.equal(drawn, other.candidates(torch.zeros(3)))
 
 
+def moved_plan(sampler: Sampler, to: list[float]) -> torch.Tensor:
+    """Make this action, (A,), the plan at all knots."""
+    knots = sampler.candidates(torch.zeros(3))
+    knots[0] = torch.tensor(to)
+    sampler.improve(knots, torch.eye(len(knots))[0])
+    return sampler.plan
+
+
+def test_candidates_are_spread_around_the_plan_and_some_around_holding_still() -> None:
+    options = PlanOptions("predictive", rollouts=600, noise=0.02)
+    sampler = Sampler(options, 10, GRIPPER, torch.tensor([1.0, 0.25, 1.0]), 0)
+    moved_plan(sampler, [0.5, -0.5, 1.0])
+    knots = sampler.candidates(torch.tensor([0.1, 0.2, 0.0]))[4:, :, :2]
+    numbers = torch.arange(4, 600)
+    hold, plan = torch.tensor([0.1, 0.2]), torch.tensor([0.5, -0.5])
+    for chosen, centre in ((numbers % 6 == 0, hold), (numbers % 6 != 0, plan)):
+        assert (knots[chosen] - centre).abs().max() < 0.15
+    alike, small, usual = (knots[numbers % 6 == k] - plan for k in (3, 5, 4))
+    # Some move the same way at all knots, in some of the dimensions; some move less; the others at each knot anew.
+    assert (alike == alike[:, :1]).all() and not (usual == usual[:, :1]).all()
+    unmoved = (alike == 0).all(1)
+    assert 0.3 < unmoved.float().mean() < 0.7 and not (usual == 0).any()
+    assert (usual.std((0, 1)) / torch.tensor([0.02, 0.005])).sub(1).abs().max() < 0.15
+    assert (small.std((0, 1)) / usual.std((0, 1))).max() < 0.5
+
+
+def test_a_gripper_is_switched_in_half_of_the_candidates_only() -> None:
+    sampler = sampler_of(PlanOptions("predictive", rollouts=600))
+    moved_plan(sampler, [0.0, 0.0, -1.0])
+    gripper = sampler.candidates(torch.zeros(3))[4:, :, 2]
+    switched = (gripper == 1).any(1).float().mean()
+    assert set(gripper.unique().tolist()) == {-1.0, 1.0} and 0.1 < switched < 0.28
+
+
+def test_the_two_best_candidates_are_tried_again_at_their_new_times() -> None:
+    sampler = sampler_of(PlanOptions("mppi", rollouts=8, knots=4), steps=4)
+    knots = sampler.candidates(torch.zeros(3))
+    sampler.improve(knots, torch.tensor([0.0, 1, 2, 9, 3, 8, 5, 6]))
+    again = sampler.candidates(torch.zeros(3))
+    # The penalty on motion may exchange close ones, so the best are far ahead.
+    kept = {tuple(each.flatten().tolist()) for each in again[2:4]}
+    assert kept == {tuple(each.flatten().tolist()) for each in knots[[3, 5]]}
+    sampler.shift(1)  # a knot a step
+    moved = sampler.candidates(torch.zeros(3))[2:4]
+    torch.testing.assert_close(moved[:, :3], again[2:4][:, 1:])
+
+
+def test_holding_still_keeps_what_the_gripper_did_last() -> None:
+    for steps, last in ((1, -1.0), (2, 1.0), (9, 1.0)):
+        sampler = sampler_of(PlanOptions("predictive", rollouts=8, knots=4), steps=4)
+        knots = sampler.candidates(torch.zeros(3))
+        knots[0, :, 2] = torch.tensor([-1.0, 1.0, 1.0, 1.0])
+        sampler.improve(knots, torch.eye(8)[0])
+        sampler.shift(steps)
+        assert sampler.candidates(torch.zeros(3))[1, :, 2].tolist() == [last] * 4
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_plan_is_made_of_the_candidates_that_earned_most(method: Method) -> None:
+    options = PlanOptions(method, rollouts=20, elites=0.1, temperature=1e-6)
+    sampler = sampler_of(options)
+    knots = sampler.candidates(torch.zeros(3))
+    returns = torch.linspace(0, 1, 20)
+    returns[[7, 11]] = torch.tensor([1000.0, 50.0])
+    returns[15] = torch.nan
+    sampler.improve(knots, returns)
+    expected = knots[[7, 11]].mean(0) if method == "cem" else knots[7]
+    torch.testing.assert_close(sampler.plan, expected)
+
+
+def test_motion_away_from_holding_still_has_to_pay() -> None:
+    hold, plans = torch.tensor([0.5, -0.5, 1.0]), []
+    for seed in range(8):
+        sampler = sampler_of(PlanOptions("mppi", rollouts=64), seed=seed)
+        for turn in range(20):
+            noise = torch.rand(64, generator=torch.Generator().manual_seed(20 * seed + turn))
+            sampler.improve(sampler.candidates(hold), noise)
+        plans.append(sampler.plan)
+    assert (torch.cat(plans).mean(0) - hold)[:2].abs().max() < 0.15
+
+
+def test_seeds_are_drawn_from_the_plans_own_generator() -> None:
+    one, same = sampler_of(seed=3), sampler_of(seed=3)
+    drawn = [one.draw_seed() for _ in range(3)]
+    torch.manual_seed(1)
+    assert drawn == [same.draw_seed() for _ in range(3)] and len(set(drawn)) == 3
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
