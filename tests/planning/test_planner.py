@@ -14,6 +14,8 @@ import torch
 
 import workbench
 from tests.planning.walking import MADE, SMALL, walk
+from workbench.envs.action_vector import action_parts, hold_action
+from workbench.envs.maniskill_private import open_env
 from workbench.envs.snapshots.cpu_state import CpuState
 from workbench.planning.rollouts import NotAlike
 
@@ -204,11 +206,19 @@ def test_random_draws_of_a_tasks_step_are_repeatable(task: Path) -> None:
 
 
 def test_rollouts_of_an_env_with_picture_observations_render_nothing() -> None:
-    env = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb")
+    env = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb", control_mode="pd_joint_pos")
     planner = planner_of(env)
-    rolled = planner._rollouts.env
+    rolled = planner.rollout_env
     assert rolled.obs_mode == "state_dict" and not rolled.scene.can_render()
+    assert rolled.control_mode == "pd_joint_pos" and planner.horizon == 4
     env.reset(seed=0)
+    hold = hold_action(action_parts(open_env(env)), 1)[0]
+    # No plan crosses the whole range of a joint.
+    away = (
+        np.abs(planner.flat_actions(0)[0] - hold)[:7]
+        / np.ptp([env.action_space.low, env.action_space.high], axis=0)[:7]
+    )
+    assert 0.003 < away.max() < 0.1
     env.step(planner.actions())
     planner.close()
     env.close()
