@@ -111,6 +111,7 @@ def test_operations_that_a_gpu_accepts(checked: Checked) -> None:
         "self.cube.pose.p.clone()[:, :2] = torch.zeros(2)",  # the assignment copies to the device
         "distance + torch.zeros(self.num_envs).to(self.device)",
         "distance + torch.zeros(self.num_envs).to(distance)",
+        "distance + torch.zeros(self.num_envs).type_as(distance)",
         "distance + torch.zeros(self.num_envs, device=self.device)",
         "distance + torch.zeros_like(distance)",
         "distance + distance.new_zeros(self.num_envs)",

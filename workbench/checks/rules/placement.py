@@ -145,14 +145,15 @@ def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
             continue
         furthest = np.nan_to_num(np.where(bad, moved, 0), nan=np.inf)
         worst = int(furthest.argmax())
-        how = "falls" if away[worst, 2] < -0.7 * moved[worst] else "moves"
+        falls = away[worst, 2] < -0.7 * moved[worst]
+        how = f"{'falls' if falls else 'moves'} {moved[worst]:.2f} m and turns {np.degrees(turned[worst]):.0f} degrees"
         seeds = [still.seeds[i] for i in np.flatnonzero(bad)]
         yield Seen(
             ("body", name, index.owners[body]),
             where_placed(checkup, index.owners[body]),
             seeds=tuple(seeds),
             size=float(furthest[worst]),
-            texts=(f"{how} {moved[worst]:.2f} m and turns {np.degrees(turned[worst]):.0f} degrees",),
+            texts=("goes to a place that is not finite" if lost[worst] else how,),
         )
 
 
