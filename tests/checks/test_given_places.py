@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from tests.checks.checked import the_finding
 from tests.checks.given import SEEDS, outcome
+from workbench.checks.evidence.builds import Built, Merged, Shape
 from workbench.checks.evidence.collect import Checkup
 from workbench.checks.evidence.rolled_episodes import Episodes, SeenOutlier
 from workbench.envs.inspection import Overlap
@@ -217,3 +220,87 @@ def test_quaternions_of_each_body_are_judged_alone(example: Checkup) -> None:
     long = the_finding(judged([1, 0, 0, 0], [0, 0, 3, 4], [0, 1, 0, 0], rule="unit-quaternion"))
     assert "goal has length 5: (0, 0, 3, 4)" in long.message and (long.file, long.line) == line[:2]  # type: ignore[index]
     assert judged([1, 0, 0, 0.02], rule="unit-quaternion").state == "kept"
+
+
+# --- bodies as they were built ---------------------------------------------------------------------------
+
+
+def built(example: Checkup, **changes: Any) -> list[Built]:
+    """What the example builds, with these changes of the bodies by name."""
+    assert example.task
+    return [replace(each, **changes.get(each.name, {})) for each in example.builds]
+
+
+def test_a_robot_without_a_pose_is_reported_where_it_is_loaded(example: Checkup) -> None:
+    finding = the_finding(outcome(example, "robot-pose", builds=built(example, panda={"quaternion": None})))
+    assert finding.message.startswith("panda ") and finding.function == "_load_agent"
+    assert outcome(example, "robot-pose", builds=built(example, cube={"quaternion": None})).state == "kept"
+    without = [each for each in example.builds if not each.of_robot]
+    assert outcome(example, "robot-pose", builds=without).state == "not_applicable"
+
+
+def test_only_a_body_that_may_be_pushed_away_needs_a_pose(example: Checkup) -> None:
+    none = {"quaternion": None}
+    finding = the_finding(outcome(example, "initial-pose", builds=built(example, cube=none)))
+    assert finding.message.startswith("cube is ") and finding.code.startswith("self.cube = builder.build(")
+    other = replace(built(example, cube=none)[-2], name="lid", quaternion=None)
+    two = outcome(example, "initial-pose", builds=[*built(example, cube=none), other])
+    assert the_finding(two).count == 2 and the_finding(two).message.startswith("cube and 1 more are ")
+    for changes in ({"kind": "static"}, {"collision": ()}, {"of_robot": True}, {"place": None}):
+        assert (
+            outcome(example, "initial-pose", builds=built(example, cube={**none, **changes})).state == "kept"
+        ), changes
+    solid = {**none, "collision": example.builds[-2].collision}
+    inside = replace(example.alone, overlaps=(Overlap(("goal", TABLE), 0.01),))
+    for alone, state in ((replace(inside, overlaps=()), "kept"), (inside, "broken")):
+        assert outcome(example, "initial-pose", builds=built(example, goal=solid), alone=alone).state == state
+    # What has no pose is reported once, not as an overlap too.
+    pair = replace(example.alone, overlaps=(Overlap(("cube", TABLE), 0.02),))
+    for builds, state in ((built(example), "broken"), (built(example, cube=none), "kept")):
+        assert outcome(example, "overlap-at-load", builds=builds, alone=pair).state == state
+
+
+def test_a_name_belongs_to_one_body(example: Checkup) -> None:
+    line = example.places.body("cube")
+    assert line is not None
+
+    def judged(*merges: tuple[str | None, str]) -> Any:
+        of = [Merged(name, frozenset(parts.split()), line) for name, parts in merges]
+        return outcome(example, "body-names", merges=of)
+
+    assert judged(("box", "part_0 part_1"), ("lid", "lid_0 lid_1")).state == "kept"
+    assert judged(("box", "part_0 part_1"), ("box", "part_1 part_0")).state == "kept", (
+        "a rebuild merges again"
+    )
+    twice = judged(("box", "part_0 part_1"), ("box", "lid_0 lid_1"))
+    assert len(twice.findings) == 2 and all(
+        "box" in one.message and " 2 " in one.message for one in twice.findings
+    )
+    assert " 2 " in the_finding(judged(("cube", "part_0 part_1"))).message
+    assert judged(("cube", "cube part_1")).state == "kept"
+    nameless = the_finding(judged((None, "part_0 part_1 part_2")))
+    assert nameless.message.startswith("3 ") and (nameless.file, nameless.line) == line[:2]
+
+
+def test_each_mesh_file_is_judged_with_the_first_body_that_uses_it(example: Checkup, tmp_path: Path) -> None:
+    heavy, light = str(tmp_path / "heavy.ply"), str(tmp_path / "light.ply")
+    trimesh.creation.icosphere(subdivisions=7).export(heavy)
+    trimesh.creation.icosphere(subdivisions=2).export(light)
+
+    def drawn(*files: str, kind: str = "file") -> tuple[Shape, ...]:
+        return tuple(Shape(kind, file, ()) for file in files)
+
+    both = built(example, cube={"visual": drawn(light)}, goal={"visual": drawn(heavy, light)})
+    again = replace(both[-1], name="later", visual=drawn(heavy))
+    finding = the_finding(outcome(example, "heavy-mesh", builds=[*both, again]))
+    assert finding.message.startswith("goal is drawn with 327,680 ") and "heavy.ply" in finding.message
+    assert finding.code.startswith("self.goal = ")
+    table = built(example, **{TABLE: {"visual": drawn(heavy)}})
+    assert outcome(example, "heavy-mesh", builds=table).state == "not_applicable", "not of the author"
+    (tmp_path / "text.ply").write_text("no mesh " * 50_000)
+    unread = built(example, cube={"visual": drawn(str(tmp_path / "text.ply"))})
+    result = outcome(example, "heavy-mesh", builds=unread)
+    assert result.state == "not_known" and "text.ply" in result.why
+    hull = built(example, cube={"collision": drawn(light, kind="convex_mesh")})
+    assert outcome(example, "hull-fills-hollow", builds=hull).state == "kept"
+    assert outcome(example, "hull-fills-hollow", builds=both).state == "not_applicable"
