@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tests.checks.checked import EXAMPLE
 from workbench.checks import run_rules as run
@@ -58,7 +58,7 @@ def flags(words: str) -> NDArray[np.bool_]:
 
 
 def episodes(
-    reward: Sequence[Sequence[float]] = (),
+    reward: ArrayLike = (),
     obs: dict[str, NDArray[np.float64]] | None = None,
     kind: str = "random",
     seeds: Sequence[int] = SEEDS,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -200,7 +201,7 @@ def shell(*sides: tuple[int, int, int]) -> trimesh.Trimesh:
         wall = trimesh.creation.box([0.01 if each else 0.2 for each in side])
         wall.apply_translation([0.1 * each for each in side])
         walls.append(wall)
-    return trimesh.util.concatenate(walls)
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(walls))
 
 
 SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, -1))

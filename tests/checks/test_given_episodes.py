@@ -16,7 +16,7 @@ from workbench.checks.evidence.odd_states import KINDS, SHORT, OddStates
 pytestmark = pytest.mark.thorough
 
 
-def nan_at(*places: tuple[int, int], shape: tuple[int, ...] = (5, 3), value: float = np.nan) -> Any:
+def nan_at(*places: tuple[int, ...], shape: tuple[int, ...] = (5, 3), value: float = np.nan) -> Any:
     """Numbers (T, K, ...) that differ everywhere, with `value` at these (step, episode)."""
     numbers = np.arange(np.prod(shape), dtype=np.float64).reshape(shape) / 100
     for place in places:

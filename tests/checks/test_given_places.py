@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,7 +204,7 @@ def test_quaternions_of_each_body_are_judged_alone(example: Checkup) -> None:
     (cube, goal), line = example.placed[-2:], example.placed[-1].place
     assert (cube.name, goal.name) == ("cube", "goal")
 
-    def judged(*rows: list[float], rule: str = "quaternion-order") -> Any:
+    def judged(*rows: Sequence[float], rule: str = "quaternion-order") -> Any:
         given = np.array(rows, np.float32)
         placed = [*example.placed[:-1], replace(goal, quaternions=given)]
         return outcome(example, rule, placed=placed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
@@ -56,7 +57,8 @@ def test_each_rule_has_the_degree_that_was_asked_for() -> None:
         assert degrees["same-seed"] == "off"
     only = degree_of_each(select=("same-seed", "reward-flat"), ignore=("reward-flat",))
     assert {rule for rule in only if only[rule] != "off"} == {"same-seed"}
-    for wrong in ({"select": ["same_seed"]}, {"ignore": ["nothing-like-it"]}):
+    wrongs: tuple[dict[str, Any], ...] = ({"select": ["same_seed"]}, {"ignore": ["nothing-like-it"]})
+    for wrong in wrongs:
         with pytest.raises(ValueError, match=re.escape(repr(*wrong.values()).strip("[]"))):
             degree_of_each(**wrong)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -22,7 +22,7 @@ from workbench.checks.evidence.over_seeds import OverSeeds
 from workbench.checks.results import RuleResult, Seen, Silenced, by_rule, failed
 from workbench.checks.rule_table import RULES, degree_of_each
 from workbench.checks.run_rules import check_rule, gpu_results
-from workbench.envs.gpu_rules import Degree, Finding
+from workbench.envs.gpu_rules import Finding
 from workbench.task.problem import Problem, TaskError
 
 pytestmark = pytest.mark.thorough
@@ -37,8 +37,8 @@ def evaluate_line(example: Checkup) -> tuple[str, int, str]:
     return place
 
 
-def run(example: Checkup, check: Check, **degrees: Degree) -> list[RuleResult]:
-    return check_rule(RULE, check, example, {**degree_of_each(), **degrees})
+def run(example: Checkup, check: Check, **degrees: str) -> list[RuleResult]:
+    return check_rule(RULE, check, example, cast(Any, {**degree_of_each(), **degrees}))
 
 
 def breach_then(raises: Callable[[Checkup], Any] = lambda checkup: None, *, found: bool = True) -> Check:

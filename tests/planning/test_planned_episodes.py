@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -161,7 +162,7 @@ def test_a_plan_is_long_enough_to_see_its_effect(
     "name", ["rollouts", "knots", "rounds", "every", "noise", "temperature", "elites", "horizon"]
 )
 def test_each_option_takes_its_least_value_and_nothing_below(name: str) -> None:
-    least = {"rollouts": 4, "knots": 2, "rounds": 1, "every": 1, "horizon": 0.0}.get(name, 1e-6)
+    least: Any = {"rollouts": 4, "knots": 2, "rounds": 1, "every": 1, "horizon": 0.0}.get(name, 1e-6)
     assert getattr(PlanOptions(**{name: least}), name) == least
     floats = [float("nan"), float("inf")] if isinstance(least, float) else []
     for wrong in (least - 1, *floats):

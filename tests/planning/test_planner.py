@@ -206,7 +206,7 @@ def test_random_draws_of_a_tasks_step_are_repeatable(task: Path) -> None:
 
 
 def test_rollouts_of_an_env_with_picture_observations_render_nothing() -> None:
-    env = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb", control_mode="pd_joint_pos")
+    env: Any = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb", control_mode="pd_joint_pos")
     planner = planner_of(env)
     rolled = planner.rollout_env
     assert rolled.obs_mode == "state_dict" and not rolled.scene.can_render()

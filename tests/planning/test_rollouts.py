@@ -37,7 +37,7 @@ pytestmark = pytest.mark.thorough
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
     """Three envs in the middle of their episodes, all in other states."""
-    env = workbench.make("PushCube-v1", 3, reward_mode="dense", **MADE)
+    env: Any = workbench.make("PushCube-v1", 3, reward_mode="dense", **MADE)
     env.reset(seed=[5, 6, 7])
     for turn in range(6):
         action = torch.zeros((3, 7))
@@ -49,7 +49,8 @@ def env() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def planner(env: Any) -> Iterator[RolloutPlanner]:
-    rolled = make_rollout_env(open_env(env), env.spec.kwargs, OPTIONS.rollouts)
+    # How the env is driven and what it earns is read from the env itself.
+    rolled = make_rollout_env(open_env(env), {}, OPTIONS.rollouts)
     planner = RolloutPlanner(rolled, OPTIONS)
     yield planner
     planner.close()
