@@ -162,10 +162,14 @@ def test_a_plan_is_long_enough_to_see_its_effect(
     "name", ["rollouts", "knots", "rounds", "every", "noise", "temperature", "elites", "horizon"]
 )
 def test_each_option_takes_its_least_value_and_nothing_below(name: str) -> None:
-    least: Any = {"rollouts": 4, "knots": 2, "rounds": 1, "every": 1, "horizon": 0.0}.get(name, 1e-6)
-    assert getattr(PlanOptions(**{name: least}), name) == least
+    least = {"rollouts": 4, "knots": 2, "rounds": 1, "every": 1, "horizon": 0.0}.get(name, 1e-6)
+
+    def made(value: Any) -> PlanOptions:
+        return PlanOptions(**{name: value})
+
+    assert getattr(made(least), name) == least
     floats = [float("nan"), float("inf")] if isinstance(least, float) else []
     for wrong in (least - 1, *floats):
         with pytest.raises(ValueError, match=name):
-            PlanOptions(**{name: wrong})
+            made(wrong)
     assert PlanOptions(elites=1.0).elites == 1
