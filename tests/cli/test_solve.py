@@ -25,7 +25,15 @@ from workbench.checks.job_items import CheckedTask
 from workbench.checks.results import RuleResult
 from workbench.cli.main import main
 from workbench.cli.output import Exit
-from workbench.cli.solve import SolveOutput, as_junit, solve_in_terminal
+from workbench.cli.solve import (
+    SolveOutput,
+    as_csv,
+    as_json,
+    as_junit,
+    print_report,
+    solve_in_terminal,
+    write_reports,
+)
 from workbench.envs.gpu_rules import FailOn, Finding
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.jobs.scheduler import Failure
@@ -149,6 +157,60 @@ def test_the_exit_code_follows_the_degrees_of_the_verdicts(
     assert output.fails(replace(FOUND, seeds=FOUND.seeds[1:], verdicts=())) == unsolved
     suite = ElementTree.fromstring(as_junit(FOUND, SolveOptions("x"), output))
     assert suite.get("failures") == str(int(found))
+
+
+def test_each_seed_is_a_row_with_its_own_numbers_in_every_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    what = replace(options_of(tmp_path / "lift.py"), plan=PlanOptions(rollouts=32))
+    print_report(FOUND)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["2", "8", "13", "9.250", "3.2"]
+    assert lines[2].split() == ["3", "-", "50", "21.500", "9.0", "it", "pays"]
+    assert "reward-exploited (warn)" in lines and "  1 of 2 episodes earned more" in lines
+    (seeds,) = [line for line in lines if "workbench help reward-exploited" in line]
+    assert seeds.split(";")[0].split() == ["seeds", "3"] and lines[-1].endswith("workbench review .")
+    many = replace(FOUND.verdicts[0], seeds=tuple(range(13)))
+    print_report(replace(FOUND, seeds=(), verdicts=(many,), wanted=4))
+    printed = capsys.readouterr().out
+    assert "10, 11 ..." in printed and "workbench review" not in printed and "note" in printed
+    report = json.loads(as_json(FOUND, what, SolveOutput(fail_on="warn")))
+    assert {name: report[name] for name in ("task", "first_seed", "solved", "tried", "median_steps", "seconds")} == {
+        "task": what.task, "first_seed": 4, "solved": 1, "tried": 2, "median_steps": 8, "seconds": 20.0,
+    }  # fmt: skip
+    assert report["plan"]["rollouts"] == 32 and report["env"] == {"render_backend": "none"}
+    assert (report["fails"], report["fail_on"], report["stopped"]) == (True, "warn", False)
+    assert report["verdicts"] == [
+        {"rule": "reward-exploited", "message": "1 of 2 episodes earned more", "seeds": [3]}
+    ]
+    assert report["notes"] == list(FOUND.notes)
+    first, second = report["seeds"]
+    assert first == {
+        "seed": 2, "solved_at": 8, "steps": 13, "return": 9.25, "seconds": 3.2, "in_the_way": "", "rules": [],
+        "recording": "2.rrd",
+    }  # fmt: skip
+    assert (second["solved_at"], second["in_the_way"]) == (None, "it pays")
+    assert second["rules"] == ["reward-exploited"]
+    both = replace(FOUND, verdicts=(*FOUND.verdicts, RewardVerdict("reward-flat", "flat", (2, 3))))
+    rows = list(csv.DictReader(io.StringIO(as_csv(both, what, SolveOutput()))))
+    assert [row["rules"] for row in rows] == ["reward-flat", "reward-exploited reward-flat"]
+    assert [row["seed"] for row in rows] == ["2", "3"] and rows[1]["solved_at"] == ""
+    suite = ElementTree.fromstring(as_junit(both, what, SolveOutput(fail_on="warn")))[0]
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("4", "2", "1")
+    assert [case.get("name") for case in suite] == ["reward-exploited", "reward-flat", "seed 2", "seed 3"]
+    assert [[child.tag for child in case] for case in suite] == [["failure"], ["failure"], [], ["skipped"]]
+    assert suite[2].get("time") == "3.200" and suite.get("time") == "20.000"
+    suite = ElementTree.fromstring(as_junit(both, what, SolveOutput()))[0]
+    assert [child.tag for child in suite[0]] == ["system-out"] and suite.get("failures") == "0"
+    none = replace(FOUND, seeds=FOUND.seeds[1:], verdicts=())
+    suite = ElementTree.fromstring(as_junit(none, what, SolveOutput()))[0]
+    assert (suite.get("tests"), suite.get("failures")) == ("2", "1") and suite[0].find("failure") is not None
+    output = SolveOutput(json_file=tmp_path / "a.json", csv_file=tmp_path / "a.csv", junit=tmp_path / "a.xml")
+    write_reports(FOUND, what, output)
+    assert (tmp_path / "a.json").read_text() == as_json(FOUND, what, output)
+    assert (tmp_path / "a.csv").read_text() == as_csv(FOUND, what, output)
+    assert "<testsuites" in (tmp_path / "a.xml").read_text()
 
 
 @pytest.mark.slow

@@ -11,7 +11,9 @@ from workbench.machine.kept_choices import (
     FILE,
     MAX_FOLDERS,
     MAX_POLICIES,
+    KeptChoices,
     close_hints,
+    keep_check_after_save,
     keep_policy,
     kept_choices,
     used_policies,
@@ -61,3 +63,12 @@ def test_a_failed_write_is_logged_and_not_raised(caplog: pytest.LogCaptureFixtur
     assert "cannot be stored for the next run" in caplog.text
     user_folder().chmod(0o700)
     assert read_private(FILE) == before
+
+
+def test_each_choice_is_stored_and_keeps_the_others() -> None:
+    assert kept_choices() == KeptChoices(hints_closed=False, check_after_save=True, policies={})
+    keep_policy(Path("/lab"), "a.py:act")
+    close_hints()
+    for wanted in (False, True, False):
+        keep_check_after_save(wanted)
+        assert kept_choices() == KeptChoices(True, wanted, {"/lab": ["a.py:act"]})
