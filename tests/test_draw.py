@@ -152,6 +152,44 @@ def test_the_newest_drawing_of_each_env_is_kept(puts: list[tuple[bool, set[int],
         np.testing.assert_array_equal(rows, wanted.get(env, np.zeros((0, 3))))
 
 
+def test_each_kind_is_kept_with_its_own_numbers_for_each_env(on: TaskDrawings) -> None:
+    """Three envs that all differ; then two of them again, in another order."""
+    rows = torch.arange(3.0)
+    position = torch.stack([rows, rows + 10, rows + 20], dim=1)
+    pair = torch.stack([position, position + 100], dim=1)
+    pose = torch.cat([position, torch.tensor([[0.0, 1, 0, 0]] * 3)], dim=1)
+    draw.points("dots", torch.stack([position, position + 1], dim=1), "#0102ff", size=0.5)
+    draw.lines("line", pair, color="#030405")
+    draw.arrows("arrow", pair[:, None], size=0.25)
+    draw.frames("frame", type("Pose", (), {"raw_pose": pose})(), size=0.75)
+    draw.text("words", position, ["a", "b", "c"])
+    draw.text("same", position.tolist(), "all")
+    drawn = on.of_batch(3)
+    assert {name: (one.kind, one.color, one.size) for name, one in drawn.items()} == {
+        "dots": ("points", (1, 2, 255), 0.5),
+        "line": ("lines", (3, 4, 5), 0.0),
+        "arrow": ("arrows", (255, 146, 43), 0.25),
+        "frame": ("frames", (255, 146, 43), 0.75),
+        "words": ("text", (255, 146, 43), 0.0),
+        "same": ("text", (255, 146, 43), 0.0),
+    }
+    for name, rows in (("line", pair), ("arrow", pair), ("frame", pose), ("words", position)):
+        np.testing.assert_array_equal(drawn[name].data[:, 0], rows.numpy())
+    np.testing.assert_array_equal(drawn["dots"].data[:, 1], position.numpy() + 1)
+    assert drawn["words"].texts == ("a", "b", "c") and drawn["same"].texts == ("all",) * 3
+    some = torch.tensor([2, 0])
+    draw.points("dots", position[some] + 50, env_idx=some)
+    draw.text("words", position[some], ["C", "A"], env_idx=[2, 0])
+    draw.remove("same")
+    draw.remove("never drawn")
+    drawn = on.of_batch(3)
+    np.testing.assert_array_equal(drawn["dots"].data[[0, 2], 0], position.numpy()[[0, 2]] + 50)
+    np.testing.assert_array_equal(drawn["dots"].data[1, :, 0], [1, 2])
+    assert drawn["words"].texts == ("A", "b", "C") and "same" not in drawn
+    position += 1  # the drawing is a copy
+    assert drawn["words"].data[1, 0, 0] == 1
+
+
 def test_without_a_workbench_nothing_is_looked_at() -> None:
     assert not drawings.on
     draw.points("it", object())

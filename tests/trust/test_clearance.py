@@ -23,7 +23,15 @@ from workbench.machine.folders import user_folder
 from workbench.review.recorded_scene import SceneError, SceneProcess
 from workbench.task.content import read_content
 from workbench.task.reference import RecordedTask
-from workbench.trust.clearance import Clearances, CodeToRun, Consent, NotCleared, Since, TrustQuestion
+from workbench.trust.clearance import (
+    Clearances,
+    CodeToRun,
+    Consent,
+    NotCleared,
+    Since,
+    TrustQuestion,
+    paths_in_arguments,
+)
 from workbench.trust.store import STORE_FILE, TrustStore
 
 pytestmark = pytest.mark.thorough
@@ -410,3 +418,105 @@ def test_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
         Clearances(ask=person).clear_file(file)
     with pytest.raises(NotCleared):
         Clearances().clear_file(listed(tmp_path, TEXT + "#\n"))
+
+
+def test_a_file_that_the_user_named_and_that_cannot_be_read_or_changes_meanwhile(tmp_path: Path) -> None:
+    file, person = listed(tmp_path), Answering(Consent.ALWAYS)
+    link = tmp_path / "link.py"
+    link.symlink_to(file)
+    for clearances in (Clearances(lambda: [link], person), Clearances(ask=person, all_trusted=True)):
+        assert clearances.clear_file(file) == str(file)
+        assert clearances.clear_file(file, "Push") == f"{file}:Push"
+    assert person.asked == [] and Clearances(ask=person).asks and not Clearances().asks
+    with pytest.raises(NotCleared) as refused:
+        Clearances(ask=person).clear_file(tmp_path / "gone.py")
+    assert refused.value.question is None and person.asked == []
+
+    def edit_and_agree(question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
+        file.write_text("evil\n")
+        return Consent.ONCE
+
+    with pytest.raises(NotCleared, match="try again"):
+        Clearances(ask=edit_and_agree).clear_file(file)
+
+
+def test_a_file_that_may_run_is_asked_about_only_for_its_saves(foreign: Path) -> None:
+    asked(todays(foreign), Consent.ALWAYS)
+    person = Answering(Consent.ALWAYS)
+    Clearances(ask=person).clear_file(foreign.parents[1] / "push.py")
+    (question,) = person.asked
+    assert question.agreed and question.followed and not question.trusted_before and not question.task
+
+
+def test_each_recording_gets_the_answer_to_its_own_text(foreign: Path) -> None:
+    """Five recordings: two of one text, one that needs no question, one refused, and one without a text."""
+    info = info_of(foreign)
+
+    def code(text: str) -> CodeToRun:
+        other = replace(info, source={file: f"{text} # {file}\n" for file in info.source})
+        return CodeToRun(reference_of(other), other, recorded_text=True)
+
+    codes = [code("yes"), CodeToRun("PickCube-v1", info), code("no"), code("yes"), code("yes too")]
+    without = replace(info, source={})
+    codes.append(CodeToRun(reference_of(without), without, recorded_text=True))
+    questions: list[TrustQuestion] = []
+
+    def ask(question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
+        questions.append(question)
+        return Consent.ONCE if question.files[0].text.startswith("yes") else Consent.NO
+
+    cleared = Clearances(ask=ask).clear_all(codes)
+    assert [isinstance(one, NotCleared) for one in cleared] == [False, False, True, False, False, True]
+    assert cleared[1] == "PickCube-v1" and cleared[0] is codes[0].reference
+    assert [question.more for question in questions] == [2, 1, 0]
+    refused, lacking = cleared[2], cleared[5]
+    assert isinstance(refused, NotCleared) and refused.question == questions[1]
+    assert isinstance(lacking, NotCleared) and lacking.question is None and not lacking.trust_helps
+
+
+def test_a_call_that_was_stopped_asks_nothing(foreign: Path) -> None:
+    person = Answering(Consent.ALWAYS)
+    with pytest.raises(NotCleared):
+        Clearances(ask=person).clear(todays(foreign), lambda: True)
+    assert person.asked == [] and len(asked(todays(foreign))) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        ({"robot_uids": "panda", "size": 0.5, "flag": True, "none": None, "dots": "v1.0"}, []),
+        ({"a": [{"b": ("../c", "d")}], "e": {"f\\g": 1}}, ["../c", "f\\g"]),
+        ({"a": "~/x", "b": "a\0.b", "c": "here.urdf", "d": "gone.urdf"}, ["~/x", "here.urdf"]),
+    ],
+)
+def test_texts_that_look_like_paths_are_found_wherever_they_are(
+    foreign: Path, arguments: dict[str, Any], found: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(foreign.parent)
+    (foreign.parent / "here.urdf").touch()
+    info = info_of(foreign)
+    for given in ({"env_kwargs": arguments}, {"env_kwargs": {}, "reset_options": arguments}):
+        assert sorted(paths_in_arguments(replace(info, **given))) == sorted(found)
+    assert paths_in_arguments(replace(info, env_kwargs={}, control_mode="/x")) == ["/x"]
+
+
+def test_only_the_newest_answers_know_their_files(foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of older answers, only the hash is kept, so the question cannot mark what has changed."""
+    monkeypatch.setattr("workbench.trust.store.MAX_ENTRIES_WITH_FILES", 2)
+    monkeypatch.setattr("workbench.trust.store.MAX_ENTRIES", 3)
+    helper = foreign.parents[1] / "helper.py"
+    contents = []
+    for number in range(4):
+        helper.write_text(f"A = {number}\n")
+        contents.append(read_content(foreign.parents[1] / "push.py"))
+        TrustStore().trust(contents[-1])
+    TrustStore().trust(contents[1])
+    kept = TrustStore()
+    assert [kept.trusts(one) for one in contents] == [False, True, True, True]
+    assert kept.trusted_before(contents[0]) == contents[1].file_sums, "the newest answer"
+    assert kept.trusted_before(contents[1]) == contents[3].file_sums
+    helper.write_text("A = 9\n")
+    for number in range(2):
+        TrustStore().trust(replace(contents[0], main=f"/other{number}.py", texts={f"/other{number}.py": ""}))
+    (question,) = asked(todays(foreign))
+    assert question.trusted_before and question.nothing_known

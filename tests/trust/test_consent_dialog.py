@@ -106,6 +106,30 @@ def test_questions_are_shown_one_after_the_other(dialog: TrustDialog, panels: Pa
     assert set(order) == set(futures)
 
 
+def test_escape_answers_no_to_the_shown_question_only(dialog: TrustDialog, panels: Panels) -> None:
+    assert not dialog.say_no()
+    first, stop = asked(dialog, about("a.py")), threading.Event()
+    window_with(panels, "a.py")
+    withdrawn, last = asked(dialog, about("b.py"), stop.is_set), asked(dialog, about("c.py"))
+    stop.set()
+    assert withdrawn.result(20) is Consent.NO
+    assert "a.py" in panels.html() and not first.done(), "another question was withdrawn"
+    assert dialog.say_no() and first.result(20) is Consent.NO
+    window_with(panels, "c.py")
+    assert not last.done()
+    panels.press(ALWAYS)
+    assert last.result(20) is Consent.ALWAYS and not dialog.say_no()
+
+
+def test_long_texts_are_cut_and_the_page_says_how_much_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.trust.consent_dialog.MAX_TEXT_CHARACTERS", 10)
+    monkeypatch.setattr("workbench.trust.consent_dialog.MAX_TOTAL_CHARACTERS", 16)
+    files = [CodeFile(f"{name}.py", name * 12, name * 10 + "Z" * more) for name, more in (("a", 4), ("b", 0))]
+    first, second = question_html(TrustQuestion("Push-v1", False, tuple(files))).split("<details>")[1:]
+    assert "a" * 10 in first and "aZ" not in first and "4" in first.replace("a" * 12, "")
+    assert "b" * 6 in second and "b" * 7 not in second.replace("b" * 12, "")
+
+
 def test_a_rebuilt_page_shows_the_question_again(dialog: TrustDialog, panels: Panels) -> None:
     future = asked(dialog)
     window_with(panels, "/home/me/push.py")

@@ -395,12 +395,7 @@ def paths_in_arguments(info: EpisodeInfo) -> list[str]:
 
 
 def _is_like_a_path(text: str) -> bool:
-    if "/" in text or "\\" in text or text.startswith("~"):
-        return True
-    try:
-        return "." in text and os.path.lexists(text)
-    except ValueError:  # a null byte
-        return True
+    return "/" in text or "\\" in text or text.startswith("~") or ("." in text and os.path.lexists(text))
 
 
 def recorded_content(info: EpisodeInfo) -> TaskContent:
