@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +17,18 @@ from rich.progress import MofNCompleteColumn, Progress, TextColumn
 from workbench.cli.arguments import JobArguments
 from workbench.cli.output import Exit
 from workbench.cli.record import RecordBar, print_recorded
-from workbench.cli.run_by import exit_after, items_of, job_path, print_part, require_job, run_by
+from workbench.cli.run_by import (
+    exit_after,
+    items_of,
+    job_path,
+    print_part,
+    require_job,
+    run_by,
+    status_in_folder,
+)
 from workbench.jobs.results_file import JobKey, Kept
 from workbench.jobs.scheduler import Failure, PoolError, ThisProcess
+from workbench.library.job_status import JobStatus, read_jobs
 from workbench.record.job import Recorded, RecordProgress
 from workbench.record.job_worker import RecordOptions, Written
 from workbench.task.problem import Problem, TaskError
@@ -226,6 +236,47 @@ def test_one_chunk_or_one_worker_needs_no_other_process(
         else:
             assert name == "" and not list(tmp_path.iterdir())
         assert isinstance(executor, ThisProcess) == here
+
+
+def test_a_job_that_fails_says_so_in_its_folder_with_the_failures_by_kind(tmp_path: Path) -> None:
+    def read() -> JobStatus:
+        (status,) = read_jobs(tmp_path, time.time())
+        return status
+
+    failures = (Failure((1,), PROBLEM), Failure((3, 4), PROBLEM), Failure((2,), replace(PROBLEM, line=9)))
+    shown: list[RecordProgress] = []
+    part = JobArguments(shard="2/3")
+    with (
+        pytest.raises(KeyboardInterrupt),
+        status_in_folder(part, "solve", "task.py", tmp_path, 9, lambda number: f"seed {number}") as status,
+    ):
+        status.with_status(shown.append)(RecordProgress(4, 30, done=4.5, failures=failures))
+        raise KeyboardInterrupt
+    found = read()
+    assert (found.state, found.command, found.task, found.done, found.total) == (
+        "failed",
+        "solve",
+        "task.py",
+        4,
+        9,
+    )
+    assert found.part == "2/3" and len(shown) == 1
+    assert [(one.items, one.count) for one in found.failures] == [
+        ("seed 1, seed 3, seed 4", 3),
+        ("seed 2", 1),
+    ]
+    assert "task.py:3" in found.failures[0].message
+    # A job that fails before it began leaves no line, and one without a folder writes nothing.
+    other = tmp_path / "other"
+    other.mkdir()
+    for out in (other, None):
+        with (
+            pytest.raises(ValueError),
+            status_in_folder(JobArguments(), "solve", "task.py", out, 9, str) as status,
+        ):
+            raise ValueError
+        status.end("failed")
+    assert read_jobs(other, time.time()) == ()
 
 
 def test_a_part_without_work_is_said_and_a_stopped_one_can_be_resumed(

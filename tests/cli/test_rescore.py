@@ -22,7 +22,7 @@ from workbench.cli.rescore import (
     rescore_all,
     rescore_in_terminal,
 )
-from workbench.episodes.row import Source
+from workbench.episodes.row import Source, UnreadableRecording
 from workbench.rescore.job import RescoredRecording, RescoreSetup
 from workbench.rescore.verdict import Verdict
 from workbench.task.description import TaskOptions
@@ -117,7 +117,9 @@ def rescoring(
         found = []
         for of in setup.items.values():
             fails = of.name in failing
-            made = of.verdict("it broke" if fails else of.why_not)
+            made = replace(
+                of.verdict("it broke" if fails else of.why_not), of=Source(Path("/far"), None, of.id)
+            )
             problem = PROBLEM if fails else None
             found.append(
                 RescoredRecording(of.place, made, of.note, failed=fails or of.refused, problem=problem)
@@ -149,7 +151,13 @@ def test_the_verdicts_are_in_the_order_of_the_files_with_one_code_a_task(
     )
     seen.clear()
     rescore_all(RescoreOptions((folder / "a.json",), task="PickCube-v1"))
-    assert [str(code.task) for code in seen[0].codes if code] == ["PickCube-v1"]
+    (code,) = seen[0].codes
+    assert code is not None and str(code.task) == "PickCube-v1" and code.recorded is None
+    monkeypatch.setattr(
+        "workbench.cli.rescore.find_all_sources", lambda _: (Source(folder, "set/0", "1", "set"),)
+    )
+    with pytest.raises(UnreadableRecording):
+        rescore_all(RescoreOptions((folder,)))
 
 
 def test_an_error_of_one_task_is_raised_only_if_no_task_gave_a_verdict(

@@ -5,13 +5,28 @@ from __future__ import annotations
 import csv
 import io
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from workbench.cli.sweep import SweepOutput, as_csv, as_json, parse_settings, print_points, write_reports
+from workbench.cli.arguments import JobArguments
+from workbench.cli.sweep import (
+    SweepOutput,
+    as_csv,
+    as_json,
+    parse_settings,
+    print_points,
+    sweep_in_terminal,
+    write_reports,
+)
 from workbench.episodes.sweep_results import SweepEpisode, SweepResults
+from workbench.library.job_status import read_jobs
+from workbench.record.job import RecordProgress
+from workbench.sweep.job import Setting, SweepOptions, SweepReport
+from workbench.task.description import TaskOptions
 
 TERMS = {"reward_terms/reach": 0.25, "reward_terms/grip": 2.0, "height": 7.0}
 
@@ -75,7 +90,7 @@ def test_columns_that_do_not_fit_are_named_below(
     assert last[-1] == "grip" and "results.parquet:" in last
     monkeypatch.setenv("COLUMNS", "20")
     *_, last = printed(RESULTS, capsys)
-    assert last[-2:] == ["reach,", "grip"], "the points and their success stay"
+    assert last[-3:] == ["results.parquet:", "reach,", "grip"], "the points and their success stay"
 
 
 def test_without_reward_terms_all_means_are_columns_and_many_points_are_counted(
@@ -140,3 +155,34 @@ def test_unclear_settings_are_refused(given: list[str]) -> None:
     with pytest.raises(ValueError, match="--set"):
         parse_settings(given)
     assert len(parse_settings(["a=1", "b=1,'1'"])) == 2
+
+
+def test_a_part_keeps_no_table_and_an_old_table_is_not_mixed_with_a_new_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    totals = set[str]()
+
+    def swept(what: SweepOptions, describe: Any, on_progress: Any, *_: object) -> SweepReport:
+        on_progress(RecordProgress(0, 1, over=(what.items[-1], None)))
+        return SweepReport(RESULTS, stopped=False)
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr("workbench.cli.sweep.sweep", swept)
+    task = Path(__file__).parents[2] / "tasks" / "reward_terms.py"
+    options = TaskOptions(num_envs=2, seed=30)
+    what = SweepOptions(str(task), (Setting("MOST", (5, 1, 2)),), tmp_path / "out", 5, options=options)
+    for shard, code in (("1/2", 0), ("2/2", 0), (None, 0), (None, 2)):
+        run = JobArguments(workers=1, shard=shard)
+        assert sweep_in_terminal(what, SweepOutput(json_file=tmp_path / "a.json"), run) == code
+        assert (tmp_path / "out" / "results.parquet").exists() == (shard is None)
+        totals |= {f"{one.total} {one.part} {one.state}" for one in read_jobs(what.out, time.time())}
+        assert (tmp_path / "a.json").exists()
+    printed = capsys.readouterr()
+    assert totals == {"7 1/2 done", "8 2/2 done", "15  done"} and printed.out.count("workbench review") == 1
+    assert f"seed 34 of {what.points[2].folder}: not kept, 0 of 7 kept" in printed.err
+    # Its own job file continues it.
+    run = JobArguments(workers=1, job=tmp_path / "sweep-1-of-2.job")
+    assert sweep_in_terminal(what, SweepOutput(), run) == 0
+    run = JobArguments(workers=1, job=tmp_path / "gone.job")
+    assert sweep_in_terminal(what, SweepOutput(), run) == 2
