@@ -250,7 +250,7 @@ def read_parts(files: Sequence[Path]) -> JobParts:
             raise FileNotFoundError(f"there is no file {path}")
         with (
             _named(path),
-            closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database,
+            closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", timeout=0, uri=True)) as database,
         ):
             about_part = _about(path, database)
             if about is None:
