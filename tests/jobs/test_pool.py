@@ -26,6 +26,7 @@ from workbench.jobs.scheduler import (
     Scheduler,
     Shard,
     ThisProcess,
+    by_kind,
     parse_shard,
 )
 from workbench.task.problem import Problem, TaskError
@@ -57,7 +58,12 @@ def test_each_item_is_done_once_with_equal_results_on_any_executor(
     assert sorted(done.results) == numbers and done.steps == len(numbers)
     assert done.results[3] == Squared(3, 9, folder / "3", done.results[3].pid)
     # Each worker opens its task only once.
-    assert len(done.updates) == (3 if executor is EXECUTORS[2].values[0] else 1)
+    count = 3 if executor is EXECUTORS[2].values[0] else 1
+    assert len(done.updates) == count
+    # The processes share the cores: PhysX and the renderer start a thread for each core of a process.
+    cores = sorted(os.sched_getaffinity(0))
+    shares = [",".join(map(str, cores[place::count] or cores)) for place in range(count)]
+    assert sorted(update.split()[-1] for update in done.updates) == sorted(shares)
     pids = {result.pid for result in done.results.values()}
     assert pids == {os.getpid()} if isinstance(executor, ThisProcess) else os.getpid() not in pids
     assert not any(map(psutil.pid_exists, pids - {os.getpid()}))
@@ -317,3 +323,113 @@ def test_a_group_with_equal_failures_is_abandoned_and_the_others_continue(stage:
             scheduler.result("a worker", number, number)
     assert failed == begun and results == list(range(10, 20))
     assert sorted(number for failure in failures for number in failure.numbers) == list(range(10))
+
+
+def test_a_worker_that_ends_or_dies_gives_back_what_is_missing() -> None:
+    probe = SchedulerProbe(range(6), chunk=2)
+    for _ in range(2):
+        probe.scheduler.next("a")
+    probe.scheduler.result("a", 0, 0)
+    probe.scheduler.result("a", 3, 3)
+    with pytest.raises(PoolError):
+        probe.scheduler.ended("a")
+    probe = SchedulerProbe(range(6), chunk=2)
+    for _ in range(2):
+        probe.scheduler.next("a")
+    for number in (0, 3):
+        probe.scheduler.result("a", number, number)
+    assert probe.scheduler.count_left(9) == 1
+    probe.scheduler.died("a", "was killed", -9)
+    assert probe.scheduler.count_left(9) == 3 and probe.scheduler.count_left(2) == 2
+    dealt = [probe.scheduler.next("b") for _ in range(3)]
+    assert [chunk and (chunk.numbers, sorted(chunk.wanted), chunk.again) for chunk in dealt] == [
+        ((4, 5), [4, 5], False), ((0, 1), [1], True), ((2, 3), [2], True),
+    ]  # fmt: skip
+    for number in (4, 5, 1, 2):
+        probe.scheduler.result("b", number, number)
+    probe.scheduler.ended("b")
+    assert sorted(probe.results) == list(range(6)) and probe.scheduler.results == 6
+
+
+def test_failed_code_gives_the_workers_other_chunk_back_whole() -> None:
+    probe = SchedulerProbe(range(4), chunk=2)
+    for _ in range(2):
+        probe.scheduler.next("a")
+    probe.scheduler.failed("a", problem(7))
+    dealt = [probe.scheduler.next("b") for _ in range(4)]
+    assert [chunk and chunk.numbers for chunk in dealt] == [(2,), (3,), (0, 1), None]
+    with pytest.raises(TaskError):
+        probe.scheduler.failed("never had a chunk", problem(7))
+
+
+def test_workers_that_die_before_their_first_chunk_end_the_job() -> None:
+    probe = SchedulerProbe(range(9))
+    for _ in range(2):
+        probe.scheduler.died("a", "was killed", -9)
+    probe.scheduler.next("b")
+    probe.scheduler.result("b", 0, 0)
+    for _ in range(2):
+        probe.scheduler.died("a", "was killed", -9)
+    with pytest.raises(PoolError):
+        probe.scheduler.died("a", "was killed", -9)
+    with pytest.raises(PoolError):
+        SchedulerProbe(range(9), tries=1).scheduler.died("a", "was killed", -9)
+
+
+def test_a_limit_never_rises_and_what_is_beyond_it_is_not_dealt_again() -> None:
+    probe = SchedulerProbe(range(9), chunk=3)
+    for worker in ("a", "b"):
+        probe.scheduler.next(worker)
+    probe.scheduler.lower(4)
+    probe.scheduler.lower(8)
+    assert probe.scheduler.limit() == 4 and probe.scheduler.count_left(9) == 0
+    probe.scheduler.result("b", 3, 3)
+    probe.scheduler.ended("b")  # 4 and 5 are not needed
+    probe.scheduler.died("a", "was killed", -9)
+    again = probe.scheduler.next("c")
+    assert again is not None and again.numbers == (0, 1, 2) and probe.scheduler.next("c") is None
+    probe.scheduler.lower(0)
+    probe.scheduler.died("c", "was killed", -9)
+    assert probe.scheduler.next("d") is None and not probe.failures
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_group_whose_workers_die_is_abandoned_with_all_its_chunks(known: bool) -> None:
+    """The items 0 to 29 are one group, and each worker that gets one of them dies."""
+    how = {"group": 30, "tries": 2, "chunk": 2}
+    probe = SchedulerProbe(range(34), known={0: 0} if known else None, **how)
+    deaths = 0
+    while (chunk := probe.scheduler.next("a")) is not None:
+        if chunk.numbers[0] < 30:
+            deaths += 1
+            probe.scheduler.died("a", "was killed", -9)
+        else:
+            for number in sorted(chunk.wanted):
+                probe.scheduler.result("a", number, number)
+    failed = sorted(number for failure in probe.failures for number in failure.numbers)
+    assert failed == list(range(int(known), 30)) and set(probe.results) == {*range(30, 34), *([0] * known)}
+    assert all(failure.problem.stage == "worker" for failure in probe.failures)
+    # A group that already had a result is tried longer.
+    assert deaths > MAX_ALIKE_FIRST if known else deaths == MAX_ALIKE_FIRST
+
+
+def test_without_any_result_the_first_failure_is_the_jobs() -> None:
+    probe = SchedulerProbe(range(2))
+    for line in (7, 8):
+        probe.scheduler.next("a")
+        probe.scheduler.failed("a", problem(line))
+    with pytest.raises(TaskError, match="it broke at 7"):
+        probe.scheduler.require_results()
+    probe = SchedulerProbe(range(2), known={1: 1})
+    probe.scheduler.next("a")
+    probe.scheduler.failed("a", problem(7))
+    probe.scheduler.require_results()
+    assert probe.scheduler.next("a") is None
+
+
+def test_failures_of_one_kind_are_joined_in_order() -> None:
+    failures = [Failure((5, 4), problem(1).problem), Failure((3,), problem(2).problem)]
+    failures += [Failure((1,), replace(problem(1).problem, message="other words"))]
+    found = by_kind(failures)
+    assert [(one.line, numbers) for one, numbers in found] == [(1, [1, 4, 5]), (2, [3])]
+    assert found[0][0] == failures[0].problem

@@ -100,6 +100,79 @@ def test_a_file_that_is_no_job_file_is_refused_and_unchanged(
     assert not path.is_file() or path.read_bytes() == before
 
 
+def test_a_part_given_twice_is_refused_by_its_first_common_item(tmp_path: Path) -> None:
+    for index in (1, 2):
+        run(tmp_path / f"{index}.job", Shard(index, 2))
+    parts = [tmp_path / "1.job", tmp_path / "2.job"]
+    assert sorted(read_parts(parts).values) == list(range(9))
+    with pytest.raises(JobFileError, match=r"1\.job and .*1\.job both .* item 0"):
+        read_parts([*parts, parts[0]])
+    with pytest.raises(JobFileError):
+        read_parts([])
+
+
+def test_a_file_that_is_open_in_another_process_is_not_used(tmp_path: Path) -> None:
+    file = JobFile(tmp_path / "a.job", JOB)
+    file.keep(3, 9)
+    for use in (lambda: JobFile(tmp_path / "a.job", JOB), lambda: read_parts([tmp_path / "a.job"])):
+        with pytest.raises(JobFileError, match=r"a\.job cannot be used"):
+            use()
+    file.close()
+    again = JobFile(tmp_path / "a.job", JOB)
+    assert (again.count, again.run, again.results(int)) == (1, file.run, {3: 9})
+    with pytest.raises(JobFileError, match=r"a\.job"):
+        again.results(str)
+    again.close()
+    other = JobFile(tmp_path / "b.job", JOB)
+    assert other.run != file.run and other.count == 0
+    other.close()
+
+
+def test_an_item_whose_files_are_gone_runs_again(tmp_path: Path) -> None:
+    run(tmp_path / "a.job")
+    made: list[int] = []
+
+    def square(setup: None, queue: ItemQueue) -> None:
+        while (chunk := queue.next()) is not None:
+            for number in sorted(chunk.wanted):
+                made.append(number)
+                queue.send_result(number, -1)
+
+    results: dict[int, int] = {}
+    scheduler: Scheduler[int, None] = Scheduler(range(9), results.__setitem__, chunk=2)
+    file = JobFile(tmp_path / "a.job", JOB)
+    Kept(ThisProcess(), file, is_there=lambda square: square not in (4, 49)).run(
+        Work(square, None, int, None, "that squares"), scheduler
+    )
+    file.close()
+    assert made == [2, 7] and results == {n: -1 if n in (2, 7) else n * n for n in range(9)}
+    assert read_parts([tmp_path / "a.job"]).results(int) == results, "the new results are kept"
+
+
+def test_results_of_parts_replace_those_of_the_whole(tmp_path: Path) -> None:
+    run(tmp_path / "part.job", Shard(1, 2))
+    whole = JobFile(tmp_path / "whole.job", JOB)
+    for number in (0, 8):
+        whole.keep(number, -1)
+    whole.close()
+    merged = read_parts([tmp_path / "part.job"])
+    write_whole(tmp_path / "whole.job", merged)
+    assert read_parts([tmp_path / "whole.job"]).results(int) == {**merged.results(int), 8: -1}
+    with pytest.raises(JobFileError, match="part"):
+        merged.requested(TaskOptions)
+    with pytest.raises(JobFileError):
+        merged.results(str)
+
+
+def test_only_some_of_many_differences_are_named(tmp_path: Path) -> None:
+    run(tmp_path / "a.job", job=replace(JOB, about={f"name{k}": "1" for k in range(8)}))
+    with pytest.raises(JobFileError) as refused:
+        JobFile(tmp_path / "a.job", replace(JOB, about={f"name{k}": "2" for k in range(8)}))
+    assert (
+        "name4" in str(refused.value) and "name5" not in str(refused.value) and "3 more" in str(refused.value)
+    )
+
+
 # --- which job it is -------------------------------------------------------------------------------------
 
 
