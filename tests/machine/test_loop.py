@@ -90,6 +90,7 @@ def test_posted_changes_run_in_order_and_a_timer_can_be_cancelled() -> None:
     do(timers[1].cancel)
     for number in range(50):
         post(lambda number=number: order.append(number))
+    do(lambda: None)
     until(lambda: "kept" in order, "the timer", seen=lambda: order)
     assert [one for one in order if one != "kept"] == list(range(50))
 
