@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.drive.panels import Panels
+from workbench.episodes.films import FilmEye
+from workbench.episodes.lerobot.export import ExportOptions
 from workbench.episodes.row import Source
 from workbench.page.door.file_response import Downloads
 from workbench.page.door.gated_server import GatedServer
 from workbench.share.commands import MakeShared
 from workbench.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView
-from workbench.share.panel import ALL_CAMERAS, MAX_NAMED, Chosen, SharePanel, will_make
+from workbench.share.panel import ALL_CAMERAS, MAX_NAMED, MAX_RESULTS, Chosen, SharePanel, will_make
 
 
 class RecordingMaking(Making):
@@ -151,3 +155,80 @@ def test_made_files_can_be_saved_and_errors_are_shown(
     panel.draw(Chosen((RECORDING,)))
     html = panels.html()
     assert "a&lt;b&gt;.mp4" in html and "2.5 MB" in html and "/offered/" in html and "<room>" not in html
+
+
+def test_every_choice_of_a_dataset_is_in_its_request(
+    panel: SharePanel, panels: Panels, making: RecordingMaking, tmp_path: Path
+) -> None:
+    two = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(2))
+    panels.set("Make", "LeRobot dataset")
+    panel.draw(Chosen(two[:1]))
+    assert not panels.shows("Only compatible ones"), "one recording fits itself"
+    panel.draw(Chosen(two, in_view=False))
+    assert panels.shows("Only compatible ones") and panels.shows("Task")
+    panels.type("Task", "  push it ")
+    panels.set("Only compatible ones", False)
+    panels.press("Make")
+    panels.type("Task", " ")
+    panels.set("Only successes", False)
+    panels.set("Only compatible ones", True)
+    panel.draw(Chosen(two))
+    panels.press("Make")
+    assert [(one.what, one.sources, one.export) for one in making.wanted] == [
+        ("lerobot", two, ExportOptions(only_successes=True, only_fitting=False, instruction="push it")),
+        ("lerobot", two, ExportOptions(only_successes=False, only_fitting=True, instruction=None)),
+    ]
+    assert all(one.folder.parent == tmp_path / "datasets" for one in making.wanted) and not making.downloads
+
+
+def test_the_choice_between_open_and_selected_recordings_counts_only_if_there_is_one(
+    panel: SharePanel, panels: Panels
+) -> None:
+    assert not panel.choose_opened(True) and panels.shows("Share")
+    panels.set("Share", "the open recordings")
+    assert panel.choose_opened(True)
+    assert not panel.choose_opened(False) and not panels.shows("Share")
+
+
+def test_a_film_of_the_view_is_seen_from_where_the_person_looks(
+    panel: SharePanel, panels: Panels, making: RecordingMaking
+) -> None:
+    looks = {
+        "position": (1.0, 2.0, 3.0),
+        "look_at": (4.0, 5.0, 6.0),
+        "up_direction": (0.0, 0.0, 1.0),
+        "fov": 0.5,
+    }
+    panels.client.camera = SimpleNamespace(**looks, image_width=640)
+    panels.set("Make", "Video of the 3D view (mp4)")
+    for in_view, width in ((True, 640), (False, 640), (True, 0)):
+        panels.client.camera.image_width = width
+        panel.draw(Chosen((RECORDING,), in_view=in_view))
+        panels.press("Make")
+    eye = FilmEye((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), (0.0, 0.0, 1.0), 0.5)
+    assert [one.eye for one in making.wanted] == [eye, None, None]
+    assert [one.what for one in making.downloads] == ["scene"] * 3
+
+
+def test_the_panel_follows_the_job_the_choice_and_the_recordings(
+    panel: SharePanel, panels: Panels, making: RecordingMaking
+) -> None:
+    """Each of them alone redraws it."""
+    chosen = Chosen((RECORDING,), ("base_camera",))
+    panel.draw(chosen)
+    seen = [panels.html()]
+    making.shown = MakingView(made=(Made((), "1 file"),))
+    panel.draw(chosen)
+    seen.append(panels.html())
+    panels.set("Make", "Sheet of pictures (png)")
+    panel.draw(chosen)
+    seen.append(panels.html())
+    panel.draw(replace(chosen, sources=(Source(Path("/recordings/other.json")),)))
+    seen.append(panels.html())
+    assert len(set(seen)) == 4 and "other.sheet.png" in seen[-1] and "1 file" in seen[1]
+    making.shown = MakingView(
+        made=tuple(Made((Path(f"/d/{k}"),), f"number {k}.") for k in range(MAX_RESULTS + 2))
+    )
+    panel.draw(chosen)
+    html = panels.html()
+    assert f"number {MAX_RESULTS - 1}." in html and f"number {MAX_RESULTS}." not in html
