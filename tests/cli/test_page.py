@@ -169,7 +169,7 @@ def test_a_files_page_opens_before_the_file_loads_and_outlives_its_failures(
     of_recording.given["on_event"](LOADED)
     assert len(machine.recent) == 3
     kept: Any = object()
-    again = choices.open("/w/other.py", TaskOptions(2), kept)
+    again = choices.open_session("/w/other.py", TaskOptions(2), kept)
     assert again.given["kept"] is kept and again.changed == {}, "it keeps how pictures are drawn"
     again.given["on_event"](LOADED)
     assert machine.recent[-1] == ("/w/other.py", TaskOptions(2))

@@ -67,6 +67,7 @@ def test_each_wish_is_one_request_and_its_files_are_printed(
     assert capsys.readouterr().out.splitlines() == [f"out/{name}.out" for name in names]
     requests.clear()
     assert share_in_terminal((), (), True, False, OUT) == Exit.DONE
+    assert [one.what for one in requests] == ["page"]
     assert share_in_terminal((), (), False, True, OUT) == Exit.DONE
     assert [one.what for one in requests] == ["page", "sheet"]
     assert share_in_terminal((), (), False, False, OUT) == Exit.REFUSED and len(requests) == 2
@@ -94,6 +95,7 @@ INCOMPLETE = replace(ONE, incomplete=("b lacks some",))
         ({"page": ValueError("no scene\nat all")}, Exit.FAILED, 1, ["no scene", "at all"]),
         ({"page": ValueError("no"), "sheet": ValueError("nor")}, Exit.REFUSED, 0, ["no", "nor"]),
         ({"page": UnreadableRecording("cut"), "sheet": ValueError("no")}, Exit.FAILED, 0, ["cut", "no"]),
+        ({"page": UnreadableRecording("cut"), "sheet": DoesNotFit("odd")}, Exit.FAILED, 0, ["cut", "odd"]),
         ({"sheet": OSError("the disk is full")}, Exit.REFUSED, 1, ["the disk is full"]),
         ({"sheet": RuntimeError("no renderer")}, Exit.REFUSED, 1, ["no renderer"]),
         ({"sheet": KeyboardInterrupt()}, Exit.INTERRUPTED, 1, ["interrupted"]),

@@ -16,7 +16,7 @@ from workbench.machine.loop import do
 from workbench.page.door.file_response import Downloads
 from workbench.page.door.gated_server import GatedServer
 from workbench.share import rerun_panel as module
-from workbench.share.commands import CloseRerun, OpenInRerun
+from workbench.share.commands import CloseRerun, MakeShared, OpenInRerun
 from workbench.share.panel import SharePart, rerun_files
 from workbench.share.rerun_panel import RerunPages, RerunView
 
@@ -200,8 +200,23 @@ def test_the_selected_recordings_are_shared_or_else_the_open_ones(parts: Parts) 
     assert parts.shown("a", selected=("b",), takes_opened=True) == ["a"] and not parts.shared.selected
     assert parts.shown("b", "a") == ["b", "a"] and parts.shared.cameras == ("hand", "eye")
     assert not parts.shared.in_view and parts.shared.successes == 1, "both are open"
+    assert parts.shown("a", "b", selected=("a",)) == ["a"] and not parts.shared.in_view, "two are in the view"
     assert parts.shown(selected=("a", "c")) == ["a", "c"] and parts.shared.successes is None
     assert parts.shown(selected=("b", "d", "gone")) == ["b"] and parts.shared.successes == 0
+
+
+def test_commands_and_the_end_of_the_page_reach_the_right_panel() -> None:
+    did: list[Any] = []
+    share = SimpleNamespace(do=lambda command, visitor: did.append(("share", command)))
+    rerun = SimpleNamespace(
+        do=lambda command, visitor: did.append(("rerun", command)), end=lambda: did.append("ended")
+    )
+    nothing: Any = None
+    part = SharePart(nothing, nothing, share, rerun)  # type: ignore[arg-type]
+    for command in (OpenInRerun(), MakeShared(), CloseRerun()):
+        part.do(command, nothing)
+    part.close()
+    assert did == [("rerun", OpenInRerun()), ("share", MakeShared()), ("rerun", CloseRerun()), "ended"]
 
 
 def test_rerun_opens_the_shared_recordings_at_the_steps_of_the_open_ones(parts: Parts) -> None:

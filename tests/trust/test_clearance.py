@@ -120,6 +120,13 @@ def test_a_local_recording_needs_no_question_even_if_its_file_has_changed(record
     assert asked(todays(recording)) == [] and asked(as_recorded(recording)) == []
 
 
+def test_a_local_recording_vouches_only_for_its_own_file(recording: Path, tmp_path: Path) -> None:
+    other = listed(tmp_path, "evil\n")
+    wanted = CodeToRun(RecordedTask("push.py", str(other)), info_of(recording))
+    (question,) = asked(wanted)
+    assert question.file == str(other)
+
+
 def test_a_foreign_recording_asks_with_file_hash_and_modules(child_process: None, foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
     (question,) = asked(todays(foreign))
@@ -441,7 +448,12 @@ def test_a_file_that_the_user_named_and_that_cannot_be_read_or_changes_meanwhile
 
 
 def test_a_file_that_may_run_is_asked_about_only_for_its_saves(foreign: Path) -> None:
-    asked(todays(foreign), Consent.ALWAYS)
+    helper = foreign.parents[1] / "helper.py"
+    for text in ("A = 2\n", "A = 1\n"):  # two versions may run
+        helper.write_text(text)
+        asked(todays(foreign), Consent.ALWAYS)
+    (question,) = asked(replace(todays(foreign), followed=True))
+    assert question.agreed and not question.trusted_before
     person = Answering(Consent.ALWAYS)
     Clearances(ask=person).clear_file(foreign.parents[1] / "push.py")
     (question,) = person.asked
@@ -510,7 +522,8 @@ def test_only_the_newest_answers_know_their_files(foreign: Path, monkeypatch: py
         helper.write_text(f"A = {number}\n")
         contents.append(read_content(foreign.parents[1] / "push.py"))
         TrustStore().trust(contents[-1])
-    TrustStore().trust(contents[1])
+    for _ in range(3):
+        TrustStore().trust(contents[1])
     kept = TrustStore()
     assert [kept.trusts(one) for one in contents] == [False, True, True, True]
     assert kept.trusted_before(contents[0]) == contents[1].file_sums, "the newest answer"
