@@ -43,6 +43,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "ids.py").touch()
     (tmp_path / "made").mkdir()
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("workbench.episodes.reader.reading.start_reading", lambda: None)
     for module in ("main", "job_commands"):
         monkeypatch.setattr(f"workbench.cli.{module}.use_private_driver", lambda: None)
     return tmp_path
