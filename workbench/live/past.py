@@ -70,13 +70,16 @@ Ending = Literal["", "success", "fail", "limit"]
 
 
 def _ending(flags: Iterable[int]) -> Ending:
-    """How a segment with these events ended; empty if it still runs or was cut short by a reset."""
-    all_flags = 0
+    """How a segment with these events, in order, ended; empty if it still runs or was cut short by a reset. Like the
+    table of envs: the first end counts, and at one step success counts before fail."""
     for one in flags:
-        all_flags |= one
-    if all_flags & FAIL:
-        return "fail"
-    return "success" if all_flags & SUCCESS else "limit" if all_flags & TRUNCATED else ""
+        if one & SUCCESS:
+            return "success"
+        if one & FAIL:
+            return "fail"
+        if one & TRUNCATED:
+            return "limit"
+    return ""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from tests.drive.session import FakeWorkerSession, fake_worker_session, moment, 
 from workbench.envs.camera_data import CameraKind, Picture
 from workbench.live.events import MomentShown
 from workbench.live.history.curves import REWARD, Column, Group
+from workbench.live.history.env_table import Outcome
 from workbench.live.history.moments import (
     BY_HAND,
     FAIL,
@@ -298,6 +299,18 @@ def test_a_moment_keeps_what_a_recording_needs_of_it(played: FakeWorkerSession) 
     assert reset.seeds is not None and reset.seeds.tolist() == [4, 5, 6] and stepped.seeds is None
     assert (reset.acted_by, stepped.acted_by) == ("", "policy a.py:act")
     assert reset.number + 1 == stepped.number and reset.as_recorded is reset.step
+
+
+def test_the_first_end_of_an_episode_is_that_of_its_block_and_of_its_row(fake: FakeWorkerSession) -> None:
+    fake.play(0)
+    fake.step(success=(0, 1), evaluate={"fail": np.array([False, True, True])})
+    fake.step(evaluate={"fail": np.array([True, False, False])})
+    blocks = []
+    for env in range(3):
+        fake.session.change(selected_env=env)
+        blocks.append(fake.session.look(lambda run: run.strip(0, 9)).segments[-1][-1])
+    outcomes = [Outcome(int(one)).name.lower() for one in fake.session.env_rows().outcome]
+    assert blocks == outcomes == ["success", "success", "fail"]
 
 
 # --- what a person does to bodies ------------------------------------------------------------------------
