@@ -73,11 +73,7 @@ def succeeds(desk: Desk) -> bool:
 def handles(desk: Desk, side: int) -> tuple[float, float]:
     """The end of the handles' green arrow, as `end_of_green`, once they rest where they belong."""
     return until(
-        lambda: (
-            (end := end_of_green(desk.page, side)) is not None
-            and end == end_of_green(desk.page, side)
-            and end
-        ),
+        lambda: end if (end := end_of_green(desk.page, side)) == end_of_green(desk.page, side) else None,
         "the handles",
     )
 

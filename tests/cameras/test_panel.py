@@ -245,7 +245,8 @@ def pictured(
     infos = tuple(replace(camera(name), settings=AT) for _, name in KEYS)
     cameras = tuple(StudioCamera(info.key, info, AT, False, None) for info in infos)
     rgb, depth = np.full((8, 16, 3), grey, np.uint8), np.full((8, 16), metres, np.float32)
-    one = Picture(key[1], key[0], env, POSE, rgb, depth + np.arange(16, dtype=np.float32) * np.float32(0.1))
+    depth = (depth + np.arange(16) * 0.1).astype(np.float32)
+    one = Picture(key[1], key[0], env, POSE, rgb, depth)
     view = running(
         2,
         selected_env=selected_env,

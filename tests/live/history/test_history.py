@@ -303,8 +303,8 @@ def test_a_moment_keeps_what_a_recording_needs_of_it(played: FakeWorkerSession) 
 
 def test_the_first_end_of_an_episode_is_that_of_its_block_and_of_its_row(fake: FakeWorkerSession) -> None:
     fake.play(0)
-    fake.step(success=(0, 1), evaluate={"fail": np.array([False, True, True])})
-    fake.step(evaluate={"fail": np.array([True, False, False])})
+    fake.step(success=(0, 1), fail=(1, 2))
+    fake.step(fail=(0,))
     blocks = []
     for env in range(3):
         fake.session.change(selected_env=env)

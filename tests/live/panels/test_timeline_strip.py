@@ -88,7 +88,10 @@ def test_a_one_step_spike_stays_in_the_line(count: int) -> None:
 
 def test_a_missing_reward_is_a_gap_and_a_constant_one_a_straight_line() -> None:
     assert reward_lines(np.full(10, np.nan, np.float32)) == []
-    for constant in (np.ones(10, np.float32), np.tile(np.nextafter(np.float32(0.4), np.float32([0, 1])), 5)):
+    for constant in (
+        np.ones(10, np.float32),
+        np.tile(np.nextafter(np.float32(0.4), np.array([0, 1], np.float32)), 5),
+    ):
         (line,) = reward_lines(constant)
         assert {point.split(",")[1] for point in line.split()} == {f"{HEIGHT / 2:.1f}"}
     lines = reward_lines(np.array([np.nan, 1, 2, np.nan, 0], np.float32))
