@@ -20,6 +20,10 @@ os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-"
 # Nor recent tasks.
 os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["XDG_CONFIG_HOME"], "state")
 
+# pytest-xdist sets these in its processes: a console of rich that is made meanwhile would keep this size.
+os.environ.pop("COLUMNS", None)
+os.environ.pop("LINES", None)
+
 import psutil
 import pytest
 from hypothesis import HealthCheck, settings

@@ -134,7 +134,11 @@ def test_a_slider_sets_its_own_dimension_in_its_own_envs_within_the_bounds(
 @pytest.mark.parametrize(
     ("text", "name", "line"),
     [
-        ("import helper\n\n\ndef act(obs):\n    return helper.fails()\n", "helper.py", 2),
+        (
+            "import policy_helper\n\n\ndef act(obs):\n    return policy_helper.fails()\n",
+            "policy_helper.py",
+            2,
+        ),
         ("\ndef act(obs):\n    return obs[:, :3]\n", "own_policy.py", 2),
         ("def act(obs):\n    return (\n", "own_policy.py", 2),
         ("x = 1\nx.nothing\n", "own_policy.py", 2),
@@ -149,7 +153,7 @@ def test_a_failure_of_a_policy_is_at_the_authors_line(
     name: str,
     line: int,
 ) -> None:
-    (tmp_path / "helper.py").write_text("def fails():\n    return 1 / 0\n")
+    (tmp_path / "policy_helper.py").write_text("def fails():\n    return 1 / 0\n")
     file = tmp_path / "own_policy.py"
     file.write_text(text)
     with pytest.raises(TaskError) as failed:

@@ -19,6 +19,7 @@ from tests.drive.waiting import TIMEOUT_SECONDS
 from workbench.app.worker.main_loop import Worker
 from workbench.envs.inspection import Inspection
 from workbench.envs.maniskill_private import mark_camera_configs
+from workbench.envs.task_drawings import drawings
 from workbench.live.messages import (
     Answer,
     Event,
@@ -111,7 +112,7 @@ def work_for(serve: Callable[[Server], None]) -> None:
 
     over = threading.Event()
     thread = threading.Thread(target=run, daemon=True)
-    handler = signal.getsignal(INTERRUPT_SIGNAL)
+    handler, drawn_before = signal.getsignal(INTERRUPT_SIGNAL), drawings.on
     thread.start()
     mark_camera_configs()  # as `work` does: a name of ManiSkill that changes later needs a new process
     try:
@@ -120,6 +121,7 @@ def work_for(serve: Callable[[Server], None]) -> None:
         over.set()
         thread.join()
         signal.signal(INTERRUPT_SIGNAL, handler)
+        drawings.on = drawn_before
     if failed:
         raise failed[0]
 

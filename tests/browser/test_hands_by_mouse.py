@@ -112,7 +112,7 @@ def test_handles_move_a_body_in_the_selected_env_only_and_undo_brings_it_back(de
     other = desk.body_position()
     desk.press("p", "m")
     desk.timeline_says("env 0")
-    before = until(lambda: (now := desk.body_position()) != other and now, "the cube of env 0")
+    before = until(lambda: now if (now := desk.body_position()) != other else None, "the cube of env 0")
     x, y = handles(desk, 1)
     page.mouse.move(x, y)
     page.mouse.down()

@@ -22,7 +22,7 @@ from tests.drive.session import (
     seek,
 )
 from tests.drive.waiting import until
-from tests.record.test_gather import assert_rows
+from tests.record.gathered import assert_rows
 from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode

@@ -10,6 +10,7 @@ import pytest
 from tests.drive.charts import Chart
 from tests.drive.episodes import made
 from tests.drive.panels import Panels
+from tests.review.recordings import aligned
 from workbench.live.panels.reward_panel import NumberRow
 from workbench.page.widgets.templates import colour
 from workbench.review.curves_panel import ReviewCurves, compared
@@ -24,21 +25,6 @@ def test_values_that_only_another_recording_has_are_in_the_table() -> None:
         {"name": "success", "mood": "good", "whole": False, "hint": "", "values": ["true", "false"]},
         {"name": "slope", "mood": "", "whole": False, "hint": "", "values": ["—", "0.10"]},
     ]
-
-
-def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) -> ReviewView:
-    """A view of recordings, each (number of steps, state at position 0)."""
-    episodes = [made(steps) for steps, _ in recordings]
-    anchors = tuple(anchor for _, anchor in recordings)
-    return ReviewView(
-        opened=tuple(Opened(str(i), f"{i}.rrd", e, find_events(e)) for i, e in enumerate(episodes)),
-        opened_serial=1,
-        selected=selected,
-        anchors=anchors,
-        position=position,
-        first=-max(anchors),
-        last=max(steps - anchor for steps, anchor in recordings),
-    )
 
 
 def drawn(panels: Panels, view: ReviewView, title: str = "reward") -> Chart:

@@ -12,9 +12,7 @@ import pytest
 from tests.drive.episodes import BODY, made, poses_of
 from tests.drive.panels import Panels
 from tests.drive.scenes import camera
-from tests.review.test_curves import aligned
-from tests.review.test_review import opened, review_of
-from tests.review.test_state import after, three
+from tests.review.recordings import after, aligned, opened, review_of, three
 from workbench.episodes.episode import CameraTrack, Episode
 from workbench.episodes.reader.reader_process import ReaderBusy
 from workbench.live.messages import CameraRequest

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from datetime import datetime
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.episodes import made, poses_of, write
-from tests.drive.waiting import until
+from tests.review.recordings import FakeLibrary, Row, close_one, opened, reach, review_of, select
 from workbench.envs.camera_data import CameraSettings, MovedCamera
 from workbench.episodes.episode import Episode
 from workbench.episodes.row import UnreadableRecording
@@ -29,80 +27,13 @@ from workbench.page.command import Refused
 from workbench.review.commands import (
     AlignRecordings,
     ChoosePlaybackSpeed,
-    CloseRecording,
     LoopPlayback,
     OpenAgain,
-    SelectRecording,
     SwapWithFirst,
 )
 from workbench.review.panel import facts_html
 from workbench.review.playback import Review
-from workbench.review.view import Opened, PictureReader, ReviewView, column_at, curves, find_events
-
-
-@dataclass(frozen=True)
-class Row:
-    id: str
-    paths: tuple[Path, ...] = ()
-    kind: str = "workbench"
-    trajectory: str | None = None
-    date: datetime | None = None
-
-    @property
-    def name(self) -> str:
-        return f"file {self.id}"
-
-
-@dataclass
-class FakeLibrary:
-    """In-memory recordings by id; an exception is raised when it is read."""
-
-    episodes: dict[str, Episode | Exception]
-    now: float = 0.0
-    extra: dict[str, tuple[Path, ...]] = field(default_factory=dict)
-
-    def view(self) -> SimpleNamespace:
-        rows = [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
-        return SimpleNamespace(rows=rows)
-
-    def read(self, row: Row, *_: object) -> Episode:
-        found = self.episodes[row.id]
-        if isinstance(found, Exception):
-            raise found
-        return found
-
-    def clock(self) -> float:
-        return self.now
-
-
-def _date(episode: Episode | Exception) -> datetime | None:
-    written = "" if isinstance(episode, Exception) else episode.info.written_at
-    return datetime.fromisoformat(written) if written else None
-
-
-def review_of(**episodes: Episode | Exception) -> tuple[Review, FakeLibrary]:
-    library = FakeLibrary(episodes)
-    return Review(library, library.read, clock=library.clock), library  # type: ignore[arg-type]
-
-
-def reach(review: Review, reached: Callable[[ReviewView], bool], what: str) -> ReviewView:
-    until(lambda: reached(review.view()), what, seen=review.view)
-    return review.view()
-
-
-def opened(review: Review, *ids: str) -> ReviewView:
-    review.open(ids)
-    return reach(
-        review, lambda view: [o.id for o in view.opened] == list(ids) and not view.loading, "opening"
-    )
-
-
-def select(review: Review, index: int) -> None:
-    review.do(SelectRecording(id=review.view().opened[index].id))
-
-
-def close_one(review: Review, index: int) -> None:
-    review.do(CloseRecording(id=review.view().opened[index].id))
+from workbench.review.view import Opened, PictureReader, column_at, curves, find_events
 
 
 def test_playback_runs_at_the_control_rate_and_stops_at_the_end() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.drive.episodes import made
+from tests.review.recordings import after, recording, three, with_opened
 from workbench.episodes.episode import BrokenFile
 from workbench.live import timeline_commands as timeline
 from workbench.live.commands import TogglePlay
@@ -39,37 +40,6 @@ from workbench.review.state import (
     apply,
     next_position_in,
 )
-from workbench.review.view import Opened, find_events
-
-LENGTHS = (10, 12, 6)
-SUCCESSES = (4, 7, None)
-
-
-def recording(name: str, steps: int, success_from: int | None = None, minute: int = 0) -> Opened:
-    """The reset, and the first success, are its events."""
-    written = f"2024-01-01T00:{minute:02}:00+00:00"
-    episode = made(steps, success_from=success_from, written_at=written)
-    return Opened(name, f"{name}.rrd", episode, find_events(episode))
-
-
-def with_opened(*opened: Opened) -> ReviewState:
-    state = ReviewState()
-    for one in opened:
-        state, _ = apply(state, RecordingRead(0, one, {Path(one.name): FileStamp(one.name, (1, 2))}), 0.0)
-    return apply(state, ReadingEnded(0), 0.0)[0]
-
-
-def three() -> ReviewState:
-    rows = zip("abc", LENGTHS, SUCCESSES, strict=True)
-    return with_opened(
-        *(recording(name, steps, success, at) for at, (name, steps, success) in enumerate(rows))
-    )
-
-
-def after(state: ReviewState, *commands: Command, now: float = 0.0) -> ReviewState:
-    for command in commands:
-        state, _ = apply(state, Asked(command), now)
-    return state
 
 
 def positions(state: ReviewState, command: Command, times: int, now: float = 0.0) -> list[int]:
