@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -403,3 +404,19 @@ def test_claims_of_a_dataset_are_bounded(episode: Episode, tmp_path: Path) -> No
     write_info({})
     os.mkfifo(folder / "data" / "chunk-000" / "file-001.parquet")
     assert lerobot_rows(folder)[0].length == episode.length
+
+
+def test_rewards_that_are_stored_as_lists_of_one_number_are_summed(
+    tmp_path: Path, succeeding: Episode
+) -> None:
+    """LeRobot itself reads these, and datasets of other programs have them."""
+    export(tmp_path / "set", succeeding)
+    path = tmp_path / "set/data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    for kind in (pa.list_(pa.float32()), pa.list_(pa.float32(), 1)):
+        lists = pa.array([[number] for number in table["next.reward"].to_pylist()], kind)
+        pq.write_table(
+            table.set_column(table.schema.get_field_index("next.reward"), "next.reward", lists), path
+        )
+        (row,) = lerobot_rows(tmp_path / "set")
+        assert row.total_reward == pytest.approx(succeeding.reward.sum())

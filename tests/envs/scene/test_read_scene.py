@@ -241,7 +241,12 @@ class OddShapesEnv(PushCubeEnv):
         pixels[0], pixels[..., 3] = 0.5, 1.0
         grey.base_color_texture = sapien.render.RenderTexture2D(pixels, "R32G32B32A32Sfloat")
         kinematic("linear", lambda b: b.add_box_visual(half_size=[0.1, 0.1, 0.1], material=grey))
-        for name, texels in (("one byte", np.full((4, 4, 1), 51, np.uint8)), ("bytes", PIXELS)):
+        wide = np.repeat(np.arange(2, dtype=np.uint8)[:, None, None] * 200, 4096, axis=1).repeat(4, axis=2)
+        for name, texels in (
+            ("one byte", np.full((4, 4, 1), 51, np.uint8)),
+            ("bytes", PIXELS),
+            ("wide", wide),
+        ):
             plain = sapien.render.RenderMaterial(base_color=[1, 0, 0, 1], metallic=0.25, roughness=0.75)
             formats = {1: "R8Unorm", 4: "R8G8B8A8Unorm"}
             plain.base_color_texture = sapien.render.RenderTexture2D(texels, formats[texels.shape[-1]])
@@ -311,6 +316,11 @@ def test_materials_and_textures_of_other_formats_are_read(odd_shapes: Any) -> No
         assert material.base_color == (1, 1, 1, 1), "a texture replaces the colour"
         assert (material.metallic, material.roughness) == (0.25, 0.75)
     assert not any(name.startswith("clear/") for name in visual), "what is invisible is left out"
+
+
+def test_a_large_texture_is_scaled_by_its_longer_side(odd_shapes: Any) -> None:
+    visual = {v.name: v for v in read_geometry(odd_shapes).visuals}
+    assert visual["wide/0"].material.texture.shape == (1, 1024, 4)
 
 
 def test_shapes_of_a_body_are_told_apart_by_size_and_place(odd_shapes: Any) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,6 +120,25 @@ def test_after_a_step_only_changes_are_sent(task: TaskEnv) -> None:
     packed = packer.pack(snapshot)
     assert packed.keys is None and packed.new_parts == {}
     assert len(packed.body) < 0.2 * len(pickle.dumps(snapshot))
+
+
+def test_a_buffer_of_the_task_that_stays_is_sent_once(task: TaskEnv) -> None:
+    env: Any = task.env
+    packer, receiver = SnapshotPacker(), Receiver()
+    env.heights = torch.rand((N, 5000))
+    try:
+        task.reset(seed=0)
+        bodies = []
+        for number in range(4):
+            if number == 3:
+                env.heights = env.heights + 1
+            packed = packer.pack(task.snapshot())
+            bodies.append(len(packed.body) + sum(map(len, packed.new_parts.values())))
+            read = unpack_snapshot(packed.body, receiver.take(packed))
+            assert same(read, task.snapshot())
+        assert bodies[2] < env.heights.nbytes / 4 < bodies[3], bodies
+    finally:
+        del env.heights
 
 
 def test_snapshots_of_changing_sets_of_envs_survive_packing(task: TaskEnv) -> None:
