@@ -219,6 +219,8 @@ def test_quaternions_of_each_body_are_judged_alone(example: Checkup) -> None:
     assert half_turn.state == "kept" and half_turn.notes[0].startswith("goal ")
     long = the_finding(judged([1, 0, 0, 0], [0, 0, 3, 4], [0, 1, 0, 0], rule="unit-quaternion"))
     assert "goal has length 5: (0, 0, 3, 4)" in long.message and (long.file, long.line) == line[:2]  # type: ignore[index]
+    short = the_finding(judged([1, 0, 0, 0], [0.3, 0, 0.4, 0], rule="unit-quaternion"))
+    assert "goal has length 0.5: (0.3, 0, 0.4, 0)" in short.message
     assert judged([1, 0, 0, 0.02], rule="unit-quaternion").state == "kept"
 
 

@@ -198,6 +198,7 @@ SMALLEST = {
     "xyz[:, 0] = torch.rand(b) * 0.3 - 0.2": "xyz[:, 0] = torch.rand(b) * 0.4 - 0.2",
     "xyz[:, 0] = torch.rand(b) * 0.3 + 0.2": "xyz[:, 0] = torch.rand(b) * 0.4 - 0.2",
     "xyz[:, 0] = torch.rand(b)": "xyz[:, 0] = torch.rand(b) * 0.4 - 0.2",
+    "xyz[:, 0] = 0.3 - torch.rand(b) * 0.4": "xyz[:, 0] = 0.2 - torch.rand(b) * 0.4",
     "xyz[:, 0] = torch.rand((b, 1))[:, 0]": "xyz[:, 0] = (torch.rand((b, 1)) * 0.4 - 0.2)[:, 0]",
     "xyz[:, :2] = uniform(-0.1, 0.2, size=(b, 2))": "xyz[:, :2] = uniform([-0.2, -0.1], 0.2, size=(b, 2))",
     "LOW, HIGH = -0.1, 0.1": "LOW, HIGH = -0.2, 0.2",

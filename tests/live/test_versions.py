@@ -230,6 +230,19 @@ def test_after_too_many_deaths_a_reload_starts_another_worker(one: FakeWorkerSes
     assert one.asked(Load) == [] and one.replaced == 1 and next_load(one) == ("disk", True)
 
 
+def test_a_version_that_is_loaded_again_has_to_prove_itself_again() -> None:
+    """Otherwise a version that ran for an hour, and crashes since its last load, would be started for ever."""
+    task, newest = description(table_scene(1)[0]), lambda: b"newest"
+    now = Recovery().loaded(task, 0.0).loaded(task, 3600.0)
+    for _ in range(2):
+        now = now.died(True, True, 3601.0, newest)
+    assert now.attempt == "nothing"
+    ran_long = Recovery().loaded(task, 0.0)
+    for hours in (1, 2):
+        ran_long = ran_long.died(True, True, 3600.0 * hours, newest)
+    assert ran_long.attempt == "moment"
+
+
 @given(st.lists(st.sampled_from(["died", "handed over", "failed", "saved", "began", "loaded"]), max_size=40))
 def test_the_number_of_restarts_is_limited(events: list[str]) -> None:
     """Between two saves only a limited number of processes is started, whatever happens to them."""

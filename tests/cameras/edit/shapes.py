@@ -120,6 +120,12 @@ WRITTEN: dict[str, str] = {
         return CameraConfig("cam", sapien.Pose([0.5, 0, 0.5], q), 128, 128, np.radians(60))
         """
     ),
+    "euler angles with their axes": _hook(
+        """\
+        q = euler2quat(0.1, 0.5, -1.5, axes="sxyz")
+        return CameraConfig("cam", sapien.Pose([0.5, 0, 0.5], q), 128, 128, np.radians(60))
+        """
+    ),
     "an intrinsic": _hook(
         """\
         return [
