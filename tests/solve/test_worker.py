@@ -65,6 +65,9 @@ def test_each_env_gets_its_own_plan_with_its_rollouts_returns(
     # Paths start at the hand.
     hand = push.description.geometry.body_names.index("panda/panda_hand_tcp")
     assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5
+    for rollouts in (4, 8):
+        (again,) = plan([0], PlanOptions(rollouts=rollouts, horizon=0.2))
+        assert len(again.returns) == len(again.paths) == rollouts
 
 
 def test_a_plan_is_requested_once_and_dropped_if_something_else_moved_the_envs(push: OpenedTask) -> None:

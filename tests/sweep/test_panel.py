@@ -112,6 +112,7 @@ def test_a_value_of_an_axis_filters_the_points(tab: Tab) -> None:
     tab.ask(FilterSweep(name="robot_uids", value='"fetch"'))
     assert tab.points() == ["2 fetch", "1 fetch", "0.5 fetch"]
     assert tab.panels.html("wb-parallel").count("wb-left-out") == 6
+    assert tab.panels.html("wb-parallel").count("wb-to-press") == 3, "only the points that are listed"
     assert "robot_uids = fetch" in tab.panels.html("wb-sweep-point"), (
         "the chosen point must be one of the listed ones"
     )
