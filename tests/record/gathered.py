@@ -1,11 +1,39 @@
-"""What the episode of one env must hold of the steps of all."""
+"""Columns and pictures that differ for each moment and env, and what the episode of one env must hold of them."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterable
 
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import Picture
 from workbench.episodes.episode import Episode
 from workbench.task.description import Stepped
+
+
+def pictures_of(number: int, env_idx: Iterable[int]) -> tuple[Picture, ...]:
+    """A picture of each env at the moment with this number."""
+    pose = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
+    return tuple(
+        Picture(
+            "base_camera",
+            "sensor",
+            env,
+            pose + np.eye(7, dtype=np.float32)[0] * env,
+            rgb=np.full((6, 8, 3), env + 10 * number, np.uint8),
+        )
+        for env in env_idx
+    )
+
+
+def columns_of(number: int, num_envs: int) -> dict[str, NDArray[np.float32]]:
+    """The columns of all envs at the moment with this number."""
+    rows = np.arange(num_envs, dtype=np.float32) + 10 * number
+    return {
+        "state/actors/cube": np.repeat(rows[:, None], 13, 1),
+        "obs/agent/qpos": np.stack([rows, -rows], 1),
+    }
 
 
 def assert_rows(episode: Episode, env: int, taken: list[Stepped]) -> None:

@@ -12,8 +12,7 @@ import pytest
 
 from tests.drive.scenes import camera, description, table_scene
 from tests.drive.session import moment
-from tests.record.gathered import assert_rows
-from workbench.envs.camera_data import Picture
+from tests.record.gathered import assert_rows, columns_of, pictures_of
 from workbench.envs.step_result import OtherEntry
 from workbench.envs.task_drawings import Drawing
 from workbench.episodes.episode import Episode
@@ -22,6 +21,11 @@ from workbench.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEp
 from workbench.task.description import Stepped
 
 ENVS = 4
+
+
+def data(number: int) -> dict[str, Any]:
+    """Pictures and columns that differ for each moment and env."""
+    return {"captured": pictures_of(number, reversed(range(ENVS))), "columns": columns_of(number, ENVS)}
 
 
 @dataclass
@@ -60,26 +64,6 @@ class Batch:
     def read(self) -> list[Episode]:
         """The ended episodes from their files."""
         return [read_episode(one.writer.finish().json) for one in self.ended]
-
-
-def data(number: int) -> dict[str, Any]:
-    """Pictures and columns that differ for each moment and env."""
-    rows = np.arange(ENVS, dtype=np.float32) + 10 * number
-    pictures = [
-        Picture(
-            "base_camera",
-            "sensor",
-            env,
-            np.array([env, 0, 1, 1, 0, 0, 0], np.float32),
-            rgb=np.full((6, 8, 3), env + 10 * number, np.uint8),
-        )
-        for env in reversed(range(ENVS))
-    ]
-    columns = {
-        "state/actors/cube": np.repeat(rows[:, None], 13, 1),
-        "obs/agent/qpos": np.stack([rows, -rows], 1),
-    }
-    return {"captured": tuple(pictures), "columns": columns}
 
 
 def test_each_env_has_the_rows_of_its_own_episode(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from tests.drive.session import (
     seek,
 )
 from tests.drive.waiting import until
-from tests.record.gathered import assert_rows
+from tests.record.gathered import assert_rows, columns_of, pictures_of
 from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
@@ -102,22 +102,7 @@ def number_of(question: CaptureMoment) -> int:
 
 def redrawn(number: int, env_idx: Any, pictures: bool = True) -> tuple[dict[str, Any], tuple[Picture, ...]]:
     """The columns and pictures that the process gives for the moment with this number."""
-    rows = np.arange(ENVS, dtype=np.float32) + 10 * number
-    drawn = [
-        Picture(
-            "base_camera",
-            "sensor",
-            env,
-            np.array([env, 0, 1, 1, 0, 0, 0], np.float32),
-            rgb=np.full((6, 8, 3), env + 10 * number, np.uint8),
-        )
-        for env in env_idx
-    ]
-    columns = {
-        "state/actors/cube": np.repeat(rows[:, None], 13, 1),
-        "obs/agent/qpos": np.stack([rows, -rows], 1),
-    }
-    return columns, tuple(drawn) if pictures else ()
+    return columns_of(number, ENVS), pictures_of(number, env_idx) if pictures else ()
 
 
 def as_recorded(fake: FakeWorkerSession, serials: list[int]) -> list[Stepped]:
