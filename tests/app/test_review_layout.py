@@ -116,6 +116,7 @@ def test_commands_of_the_page_itself(shown: Reviewed) -> None:
     assert sent == [render("toggle_timeline"), render("open_tab", tab="Curves", fold="reward")]
     shown.do(ShowLive())
     assert len(shown.client.notices) == 1, "no task is open"
+    assert FrameScene.help() in shown.commands() and ShowLive.help() not in shown.commands()
     shown.open(1)
     shown.draw()
     assert shown.nodes("/cameras/sensor")
