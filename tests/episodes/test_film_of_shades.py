@@ -52,6 +52,7 @@ def read(film: Path) -> list[NDArray[np.uint8]]:
 
 
 @pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.usefixtures("child_process")
 def test_a_film_of_an_odd_size_is_padded_or_keeps_its_size(tmp_path: Path, exact: bool) -> None:
     picture = np.full((33, 25, 3), 200, np.uint8)
     encoding = Encoding(exact_size=exact, key_every=2)
@@ -64,6 +65,7 @@ def test_a_film_of_an_odd_size_is_padded_or_keeps_its_size(tmp_path: Path, exact
 
 
 @pytest.mark.parametrize(("first", "count"), [(0, 3), (3, 4), (9, 1)])
+@pytest.mark.usefixtures("child_process")
 def test_a_part_of_a_film_holds_its_own_frames(tmp_path: Path, first: int, count: int) -> None:
     write_mp4(tmp_path / "a.mp4", shades(*range(20, 220, 20)), fps=20)
     part = FilmPart(tmp_path / "a.mp4", first / 20, count, 20.0)

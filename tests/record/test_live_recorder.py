@@ -85,6 +85,7 @@ def test_an_invalid_step_ends_the_recording_with_a_message_and_keeps_the_thread(
         stop_listening(notices.append)
 
 
+@pytest.mark.usefixtures("child_process")
 def test_the_previous_episode_is_the_last_one_with_a_step_however_often_the_env_was_reset(
     tmp_path: Path,
 ) -> None:

@@ -270,6 +270,7 @@ def test_each_task_is_rescored_in_its_own_process_turn_and_counted(recordings: R
     assert recordings.process.ended == 2, "no code of a recording stays loaded"
 
 
+@pytest.mark.usefixtures("child_process")
 def test_a_task_that_fails_is_a_row_and_the_others_are_rescored(recordings: Recordings) -> None:
     recordings.cleared.refused = {"B-v1": "not trusted"}
     recordings.raises = {"A-v1": PROBLEM}
@@ -308,6 +309,7 @@ def test_a_stopped_rescoring_keeps_its_rows_and_goes_no_further(recordings: Reco
     assert len(recordings.rescore("done").verdicts) == 4
 
 
+@pytest.mark.usefixtures("child_process")
 def test_recordings_that_one_env_can_rescore_are_a_group(tmp_path: Path) -> None:
     def recorded(name: str, **info: Any) -> Source:
         return source(write(tmp_path / name, made(2, **info), pictures=False))
