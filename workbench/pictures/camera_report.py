@@ -153,7 +153,7 @@ class DepthReport:
 
 @dataclass(frozen=True, eq=False)
 class CameraReport:
-    """What one camera, or a placement that does not exist yet, sees in E envs."""
+    """What one camera, or a placement that does not exist yet, sees in E envs. Compared by identity."""
 
     camera: CameraKey
     size: tuple[int, int]

@@ -70,7 +70,7 @@ class Visual:
 
 @dataclass(frozen=True, eq=False)
 class SceneGeometry:
-    """Everything about a scene that does not change from frame to frame.
+    """Everything about a scene that does not change from frame to frame. Compared by identity.
 
     A frame is one array, ``poses[env, body] = [x, y, z, qw, qx, qy, qz]`` in the env's own world frame (metres, z up, quaternion
     wxyz), NaN for a body that an env does not have. Equal shapes are one `Visual` with many instances: a browser draws a

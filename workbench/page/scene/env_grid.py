@@ -30,7 +30,7 @@ ACTING_MARGIN_METRES = np.float32(0.08)
 
 @dataclass(frozen=True, eq=False)
 class EnvLayout:
-    """The bounding box of one env and the offset of each env, in metres, z up.
+    """The bounding box of one env and the offset of each env, in metres, z up. Compared by identity.
 
     All envs are at the origin of their own frames. A pose in the page is the env's own pose plus its offset on a grid. The
     grid's spacing comes from the contents of one env (table and robot, without floor or backdrop). Floors are wide enough
