@@ -260,6 +260,9 @@ def test_a_new_scene_is_framed_whole_or_as_the_human_camera_sees_it(live: Live) 
     np.testing.assert_allclose((look_at - position)[1:], 0, atol=1e-6)
     assert look_at[0] < position[0], "towards -x, as the camera looks"
     near = np.linalg.norm(look_at - position)
+    live.show(shown(1))
+    live.do(FrameScene())
+    assert viewpoint(live).tolist() == [position.tolist(), look_at.tolist()], "env 1 has no picture yet"
     assert seen.task is not None
     live.show(replace(seen, task=replace(seen.task, cameras=(camera(), wide))))
     live.do(FrameScene())

@@ -27,6 +27,7 @@ from workbench.cameras.view import shown_cameras
 from workbench.checks.panel import TAB as CHECKS
 from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
+from workbench.envs.camera_data import Picture
 from workbench.hands.drive_panel import DrivePanel, DrivingSign
 from workbench.hands.joints_panel import TITLE as JOINTS
 from workbench.hands.joints_panel import JointsPanel, with_dragged_joint
@@ -73,7 +74,7 @@ from workbench.page.scene.body_pick import HOVER_COLOUR, BodyMark, body_under_ra
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.page.scene.frames import BodyFrames
 from workbench.page.scene.task_drawings import TaskDrawingsView
-from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
+from workbench.page.scene.viewpoint import View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.frame import add_bar
@@ -175,7 +176,9 @@ class Page:
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
         self._built: tuple[bool, DrawStyle, bool] | None = None
-        self._waits_for_human = False
+        self._human: Picture | None = None
+        """Newest picture of the human camera in this scene. An env that was just selected has no picture yet, and its view
+        would turn away from that camera."""
         stage = stage or View3D(server)
         self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
 
@@ -525,12 +528,15 @@ class Page:
         self._solve.draw_in_view(view, offset)
         # A scene of another size is framed again; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
-        if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
-            self._waits_for_human = alone
+        is_new = self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size))
+        human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
+        came = human is not None and self._human is None
+        if human is not None or is_new:
+            self._human = human
+        if is_new:
             self._framing.frame_new(lambda aspect: self._viewpoint(view, aspect))
-        if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
+        elif came and alone:
             # The human camera's pose arrives with its first picture, after the scene.
-            self._waits_for_human = False
             self.frame(view, untouched_only=True)
         self._framing.frame_untouched(lambda aspect: self._viewpoint(view, aspect))
 
@@ -546,12 +552,15 @@ class Page:
     def _viewpoint(self, view: SessionView, aspect: float) -> Viewpoint:
         assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
         if self._icons.only_selected or view.task.num_envs == 1:
-            human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV_RADIANS)
+            human, camera = self._human, None
+            if human is not None:
+                camera = next((c for c in view.task.cameras if c.key == human.key), None)
+            if camera is not None:
+                return frame_one(self._layout, human, aspect, camera.fovy)
             acting = None
-            if human is None and view.step is not None:
+            if view.step is not None:
                 acting = acting_box(view.task.geometry, view.step.poses, self._layout)
-            return frame_one(self._layout, human, aspect, fovy, acting)
+            return frame_one(self._layout, None, aspect, acting=acting)
         return frame_all(self._layout, aspect)
 
     async def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
