@@ -18,7 +18,7 @@ def test_each_joint_of_two_robots_is_found_in_its_own_column() -> None:
     task.reset(0)
     qpos = task.step(action_vector.random_action(task.parts, 2, np.random.default_rng(0))).qpos
     robots = read_robots(env)
-    assert len(robots) == 2
+    assert len(robots) == 2 and qpos is not None
     for robot, agent in zip(robots, named_agents(env).values(), strict=True):
         columns = [joint.column for joint in robot.joints]
         np.testing.assert_allclose(qpos[:, columns], agent.robot.get_qpos().numpy(), atol=1e-6)

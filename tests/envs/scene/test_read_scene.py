@@ -320,7 +320,8 @@ def test_materials_and_textures_of_other_formats_are_read(odd_shapes: Any) -> No
 
 def test_a_large_texture_is_scaled_by_its_longer_side(odd_shapes: Any) -> None:
     visual = {v.name: v for v in read_geometry(odd_shapes).visuals}
-    assert visual["wide/0"].material.texture.shape == (1, 1024, 4)
+    texture = visual["wide/0"].material.texture
+    assert texture is not None and texture.shape == (1, 1024, 4)
 
 
 def test_shapes_of_a_body_are_told_apart_by_size_and_place(odd_shapes: Any) -> None:
