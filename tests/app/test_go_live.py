@@ -15,6 +15,7 @@ import viser
 from tests.drive.episodes import made, write
 from tests.drive.panels import Panels
 from tests.drive.scenes import problem
+from tests.drive.session import worker_of
 from tests.drive.waiting import until
 from workbench.app import go_live
 from workbench.app.go_live import GoLive, GoLivePart
@@ -133,12 +134,12 @@ def test_going_live_in_the_open_task_is_immediate_and_switches_the_page_even_if_
 
 
 def test_a_failure_while_going_live_shows_the_live_page_but_an_earlier_failure_does_not(desk: Desk) -> None:
-    desk.live._take(TaskFailed(problem(), kept=True))
-    desk.live._worker.goes_back = False  # type: ignore[attr-defined]
+    worker_of(desk.live).tell(TaskFailed(problem(), kept=True))
+    worker_of(desk.live).goes_back = False
     desk.go(0)
     time.sleep(0.2)  # time in which a failure would switch the page
     assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.shown == []
-    desk.live._take(TaskFailed(problem(), kept=True))
+    worker_of(desk.live).tell(TaskFailed(problem(), kept=True))
     desk.wait_for_the_live_page()
 
 
@@ -186,7 +187,7 @@ def test_a_second_press_cancels_going_live_and_its_question(desk: Desk) -> None:
 
 
 def test_reopening_the_review_cancels_going_live(desk: Desk) -> None:
-    desk.live._worker.goes_back = False  # type: ignore[attr-defined]
+    worker_of(desk.live).goes_back = False
     desk.go(0)
     until(lambda: desk.go_live.going().startswith("restoring"), "the restore")
     GoLivePart(desk.app.shared.server, desk.go_live)

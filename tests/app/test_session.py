@@ -162,7 +162,7 @@ def test_an_effect_that_fails_costs_only_itself(
         def fails(request: object) -> None:
             raise Deaf("no worker")
 
-        worker = cast(Any, fake)._worker
+        worker = cast(Any, fake.worker)
         send = worker.send
         worker.send = fails
         with pytest.raises(Deaf):

@@ -71,7 +71,7 @@ class Machine:
             raise SystemExit(code)
 
         monkeypatch.setattr(module.os, "_exit", leave)
-        monkeypatch.setattr(module, "_CLOSING_SECONDS", 0.05)
+        monkeypatch.setattr(module, "CLOSING_SECONDS", 0.05)
 
     def signal(self, number: signal.Signals) -> None:
         self._handlers[number]()

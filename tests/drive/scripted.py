@@ -70,7 +70,7 @@ class ScriptedWorker:
         output: Output,
     ) -> None:
         self._task, self._start, self._evaluate = task, poses, evaluate
-        self._first_requests, self._tell = first_requests, on_event
+        self._first_requests, self.tell = first_requests, on_event
         self._lived: list[StepResult] = []
         self._playing = False
         self._requests: queue.Queue[Request | None] = queue.Queue()
@@ -112,11 +112,11 @@ class ScriptedWorker:
         count = self._task.num_envs
         if isinstance(request, Load):
             first = self._at(self._start, np.zeros(count, np.int32))
-            self._tell(Loaded(self._task, first, {"import": 1.0}))
+            self.tell(Loaded(self._task, first, {"import": 1.0}))
             self._send(first, range(count), seeds=np.arange(count))
         elif isinstance(request, Play):
             self._playing = request.playing
-            self._tell(Status(self._playing, 1 / STEP_SECONDS, 1.0, handled=request.number))
+            self.tell(Status(self._playing, 1 / STEP_SECONDS, 1.0, handled=request.number))
         elif isinstance(request, SingleStep):
             self._playing = False
             self._step()
@@ -157,13 +157,13 @@ class ScriptedWorker:
         self._lived.append(step)
         begins = np.isin(np.arange(self._task.num_envs), list(envs))
         number = len(self._lived)
-        self._tell(Stepped(step, begins, snapshot=b"a moment", part_keys=(), number=number, **more))
+        self.tell(Stepped(step, begins, snapshot=b"a moment", part_keys=(), number=number, **more))
 
     def _draw(self, request: Settings) -> None:
         grey = np.full((6, 8, 3), 128, np.uint8)
         pose = np.array([1, 0, 0.5, 1, 0, 0, 0], np.float32)
         wanted = [Picture(one.name, one.kind, request.selected_env, pose, grey) for one in request.cameras]
-        self._tell(Pictures(tuple(wanted), 1.0, len(self._lived)))
+        self.tell(Pictures(tuple(wanted), 1.0, len(self._lived)))
 
 
 def scripted(

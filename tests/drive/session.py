@@ -113,7 +113,7 @@ class FakeWorkerSession:
     """A session whose worker is the test: `asked` returns the worker's requests, `tell` sends its events."""
 
     def __init__(self, session: Session, worker: FakeWorker) -> None:
-        self.session, self._worker = session, worker
+        self.session, self.worker = session, worker
         self.rescored: list[object] = []
         """Loads that the session asked to rescore the past with; nothing is rescored."""
         session._past_rescorer.perform = self._rescore
@@ -127,12 +127,12 @@ class FakeWorkerSession:
     @property
     def replaced(self) -> int:
         """How often the session asked to replace the worker."""
-        return self._worker.replaced
+        return self.worker.replaced
 
     def asked(self, kind: type[Kind]) -> list[Kind]:
         """Requests of this kind since the last call of this method; drops those of other kinds."""
-        sent = self._worker.sent[:]
-        self._worker.sent.clear()
+        sent = self.worker.sent[:]
+        self.worker.sent.clear()
         return [request for request in sent if isinstance(request, kind)]
 
     def _rescore(self, effect: RescoreEffect) -> None:
@@ -141,14 +141,14 @@ class FakeWorkerSession:
 
     def greet(self) -> list[Request]:
         """The first requests to a new worker."""
-        return self._worker.first_requests()
+        return self.worker.first_requests()
 
     def tell(self, *events: Event) -> None:
         for event in events:
-            self._worker.on_event(event)
+            self.worker.on_event(event)
 
     def die(self, death: Death | None = None) -> None:
-        self._worker.on_death(DEATH if death is None else death)
+        self.worker.on_death(DEATH if death is None else death)
 
     def load(
         self, level: str | None = None, num_envs: int = 3, same_scene: bool = False, **changes: Any
@@ -336,10 +336,15 @@ def seek_by(session: Session, steps: int) -> None:
         session.do(StepForward() if steps > 0 else StepBack())
 
 
+def worker_of(session: Session) -> Any:
+    """What `make_worker` made, or the supervisor."""
+    return session._worker
+
+
 def after_worker_reply(session: Session) -> SessionView:
     """The view after the worker has handled every earlier request: it has answered an inspection."""
     before = session.view().inspection
-    session._worker.send(Inspect(0, ("joints",)))
+    worker_of(session).send(Inspect(0, ("joints",)))
     return wait_until(session, lambda view: view.inspection is not before, "an answer of the worker")
 
 

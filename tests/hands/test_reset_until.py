@@ -84,7 +84,7 @@ def test_the_env_in_front_is_preferred_and_the_run_pauses(tmp_path: Path, begun:
         fake.session.happen(ResetTried(6, 3, (0, 1)))
         assert fake.view.of(ResetSearch).state == "found"
         assert (fake.view.seed, fake.view.selected_env) == (6, 1)
-        assert fake._worker.sent.count(Reset(None, 6)) == 1 and not fake.asked(Play)[-1].playing
+        assert fake.worker.sent.count(Reset(None, 6)) == 1 and not fake.asked(Play)[-1].playing
         fake.session.do(ResetUntil())
         assert begun[-1].seeds[0] == 9
 

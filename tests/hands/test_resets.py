@@ -102,7 +102,9 @@ def test_a_new_version_is_sampled_again_and_late_results_are_dropped(
             fake.session.do(SampleResets())
         fake.load()
         begun: list[object] = []
-        monkeypatch.setattr(fake.session._resets, "perform", begun.append)
+        monkeypatch.setattr(
+            "workbench.hands.resets.ResetJobs.perform", lambda _, effect: begun.append(effect)
+        )
         fake.session.do(SampleResets())
         states = FirstStates(fake.view.step.poses)
         fake.session.happen(ResetSampled(0, states))

@@ -32,7 +32,7 @@ def test_an_effect_that_fails_once_is_reported_and_affects_nothing_else(tmp_path
     listen(said.append)
     try:
         with fake_worker_session(tmp_path, worker=FailsOnce) as fake:
-            worker = fake.session._worker
+            worker = fake.worker
             assert isinstance(worker, FailsOnce)
             fake.play(2)
             fake.asked(object)

@@ -195,7 +195,7 @@ def test_a_version_that_crashes_early_twice_is_replaced_by_the_one_before(
     runs(one, file, NEW, "patched")
     one.die()
     assert next_load(one) == (NEW, True)
-    monkeypatch.setattr(recovery, "_PROVEN_SECONDS", -1.0)  # from now on the version counts as proven
+    monkeypatch.setattr(recovery, "PROVEN_SECONDS", -1.0)  # from now on the version counts as proven
     for _ in range(3):
         runs(one, file, NEW)
         one.die()

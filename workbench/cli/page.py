@@ -34,7 +34,7 @@ from workbench.start.recents import RecentTasks
 from workbench.task.description import ShownPictures, TaskOptions
 from workbench.task.reference import TaskName, named_file
 
-_CLOSING_SECONDS = 1.4
+CLOSING_SECONDS = 1.4
 """Closing is given up if no episode has been written for this time, because a disk may hang."""
 _SAVING_SECONDS = 2.0
 """Maximum time for which closing waits for episodes that are being saved from the history."""
@@ -272,11 +272,11 @@ def _serve(
 
 
 def _close(app: App, gated_server: GatedServer) -> None:
-    """Close everything. Gives up after `_CLOSING_SECONDS` in which no episode was written."""
+    """Close everything. Gives up after `CLOSING_SECONDS` in which no episode was written."""
     app.finish_saving(_SAVING_SECONDS)
     closing = BlockingPool("closing").begin(app.close)
     written = _episodes_written(app)
-    while not futures.wait([closing], _CLOSING_SECONDS).done:
+    while not futures.wait([closing], CLOSING_SECONDS).done:
         if written == (written := _episodes_written(app)):
             warn("closing timed out; unfinished recordings are recovered at the next start")
             break

@@ -15,7 +15,7 @@ Newest = Callable[[], bytes | None]
 """Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only
 when needed, because assembling the snapshot takes longer than a step."""
 _GOOD_VERSIONS = 2
-_PROVEN_SECONDS = 30.0
+PROVEN_SECONDS = 30.0
 """A version that ran for longer than this before its process crashed counts as one that works."""
 
 
@@ -158,7 +158,7 @@ class Recovery:
         after, version = replace(self, attempt="moment"), self.good[-1]
         if not crashed:
             return after
-        proven = now - version.since > _PROVEN_SECONDS
+        proven = now - version.since > PROVEN_SECONDS
         version = replace(
             version,
             crashes=0 if proven else version.crashes + 1,

@@ -83,7 +83,7 @@ def test_pictures_of_a_deleted_recording_are_read_while_it_is_open(tmp_path: Pat
 def test_pictures_of_several_chunks_are_read_in_any_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(layout, "_MAX_PICTURES", 3)
+    monkeypatch.setattr(layout, "MAX_PICTURES", 3)
     monkeypatch.setattr(read, "CACHE_BYTES", 0)
     episode = read_episode(write(tmp_path, made(10)).with_suffix(".rrd"))
     assert camera_of(episode).frame.tolist() == list(range(11))

@@ -24,9 +24,9 @@ from workbench.episodes.writing.journal import Journal, JournalEntry, claim, rea
 @pytest.fixture(autouse=True)
 def no_thread_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stop the journal thread, so that each test decides when to write."""
-    keeper = type(journals._journal_threads)()
+    keeper = type(journals.journal_threads)()
     monkeypatch.setattr(keeper, "watch", lambda journal: None)
-    monkeypatch.setattr(journals, "_journal_threads", keeper)
+    monkeypatch.setattr(journals, "journal_threads", keeper)
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_a_journal_has_one_writer_and_later_one_exclusive_claim(tmp_path: Path, 
 def test_threads_write_all_journals_and_end_with_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journals, "_journal_threads", type(journals._journal_threads)())
+    monkeypatch.setattr(journals, "journal_threads", type(journals.journal_threads)())
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
     lasting: set[str] = set()
     fsync = os.fsync
@@ -165,7 +165,7 @@ def test_threads_write_all_journals_and_end_with_the_last(
 def test_rows_that_are_held_back_are_added_before_each_write_until_their_owner_is_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journals, "_journal_threads", type(journals._journal_threads)())
+    monkeypatch.setattr(journals, "journal_threads", type(journals.journal_threads)())
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
 
     class Batch:
@@ -227,7 +227,7 @@ def test_a_scene_is_read_back_with_all_its_numbers(tmp_path: Path) -> None:
 
 
 def test_rows_are_still_written_while_a_sync_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "_journal_threads", type(journals._journal_threads)())
+    monkeypatch.setattr(journals, "journal_threads", type(journals.journal_threads)())
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
     hangs, goes_on = threading.Event(), threading.Event()
 

@@ -144,7 +144,7 @@ def in_turns(background: Background, job: Job, work: Work, priority: Priority = 
 def test_garbage_from_a_process_ends_its_job_and_the_next_job_gets_a_new_process(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    monkeypatch.setattr(askers, "_LOAD_CANCEL_TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(askers, "LOAD_CANCEL_TIMEOUT_SECONDS", 1.0)
     job, load = Job("rescoring"), load_of(tmp_path)
     file = Path(str(load.task))
     provoke(file, "import", what)
@@ -203,7 +203,7 @@ def test_a_version_is_loaded_once_and_again_after_a_death_or_failure(
 def test_the_newest_job_goes_first_and_an_interrupted_one_is_repeated(
     background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(askers, "_CANCEL_TIMEOUT_SECONDS", TIMEOUT_SECONDS)  # also on a busy machine
+    monkeypatch.setattr(askers, "CANCEL_TIMEOUT_SECONDS", TIMEOUT_SECONDS)  # also on a busy machine
     load = load_of(tmp_path)
     done, under_way, seen = list[str](), threading.Event(), threading.Event()
     pids = set[int | None]()

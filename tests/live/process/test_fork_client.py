@@ -124,7 +124,9 @@ def test_a_worker_with_other_code_or_settings_is_not_forked(
     for change in (
         lambda to: to.setenv("MS_ASSET_DIR", str(tmp_path)),
         lambda to: to.chdir(tmp_path),
-        lambda to: to.setattr(fork_client, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))),
+        lambda to: to.setattr(
+            fork_client, "GPU_DEVICES", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))
+        ),
     ):
         with monkeypatch.context() as changed:
             change(changed)

@@ -114,16 +114,16 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_process, "worker_forks", SimpleNamespace(start=fork_client.start_anew))
     # Timeouts of seconds, for slow machines, are tenths here.
     for name, seconds in (
-        ("_BUSY_SECONDS", 0.8),
-        ("_STACK_PERIOD_SECONDS", 0.3),
-        ("_INTERRUPT_TIMEOUT_SECONDS", 0.3),
-        ("_HEADLESS_SECONDS", 0.8),
+        ("BUSY_SECONDS", 0.8),
+        ("STACK_PERIOD_SECONDS", 0.3),
+        ("INTERRUPT_TIMEOUT_SECONDS", 0.3),
+        ("HEADLESS_SECONDS", 0.8),
     ):
         monkeypatch.setattr(supervisor, name, seconds)
     for name, seconds in (
-        ("_LOAD_WAIT_SECONDS", 0.3),
-        ("_SILENCE_TIMEOUT_SECONDS", 1.2),
-        ("_RESTART_DELAY_SECONDS", 0.05),
+        ("LOAD_WAIT_SECONDS", 0.3),
+        ("SILENCE_TIMEOUT_SECONDS", 1.2),
+        ("RESTART_DELAY_SECONDS", 0.05),
     ):
         monkeypatch.setattr(supervisor, name, seconds)
 
@@ -202,7 +202,7 @@ def test_long_work_is_reported_repeatedly_and_when_it_is_over() -> None:
         reports = [busy for busy in one.busy if busy is not None]
         assert (
             len(reports) >= 2
-            and reports[0].seconds >= supervisor._BUSY_SECONDS
+            and reports[0].seconds >= supervisor.BUSY_SECONDS
             and reports[-1].seconds > reports[0].seconds
         )
         assert (
@@ -318,7 +318,7 @@ def test_a_broken_worker_is_ended_with_a_reason_and_replaced(does: str, fails: i
 def test_a_worker_without_main_thread_may_end_on_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervisor, "_HEADLESS_SECONDS", 600.0)
+    monkeypatch.setattr(supervisor, "HEADLESS_SECONDS", 600.0)
     with supervised() as one:
         one.worker.send(do("ends_soon_without_a_main_thread 0.5"))
         assert "exit code 7" in one.until_dead().why
@@ -391,14 +391,14 @@ def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
 
 @pytest.mark.slow
 def test_a_spare_replaces_a_dead_worker(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(supervisor, "SPARE_DELAY_SECONDS", 0.0)
     with supervised(WorkerOptions(spare=True)) as one:
         assert one.worker.vitals.spare_memory is None
         one.worker.send(do("loaded"))
         one.until(lambda: one.worker.vitals.spare_ready, "the spare")
         assert (one.worker.vitals.spare_memory or 0) > 0
         # A new spare would be ready before the assertion.
-        monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 600.0)
+        monkeypatch.setattr(supervisor, "SPARE_DELAY_SECONDS", 600.0)
         first = one.worker.pid
         os.kill(first or 0, signal.SIGKILL)
         one.until_greeted(2)
@@ -410,7 +410,7 @@ def test_a_spare_replaces_a_dead_worker(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_spare_that_dies_while_warming_up_is_tried_only_once_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(supervisor, "SPARE_DELAY_SECONDS", 0.0)
     spare = SpareWorker(WarmUp(OPTIONS))
 
     def lives() -> bool:

@@ -44,12 +44,12 @@ def short_timeouts() -> Iterator[None]:
     """Timeouts of several seconds, for slow machines, are about one second here."""
     with pytest.MonkeyPatch.context() as patch:
         for name, seconds in (
-            ("_BUSY_SECONDS", 1.0),
-            ("_STACK_PERIOD_SECONDS", 0.3),
-            ("_INTERRUPT_TIMEOUT_SECONDS", 0.5),
+            ("BUSY_SECONDS", 1.0),
+            ("STACK_PERIOD_SECONDS", 0.3),
+            ("INTERRUPT_TIMEOUT_SECONDS", 0.5),
         ):
             patch.setattr(supervisor, name, seconds)
-        for name, seconds in (("_LOAD_WAIT_SECONDS", 0.7), ("_SILENCE_TIMEOUT_SECONDS", 2.0)):
+        for name, seconds in (("LOAD_WAIT_SECONDS", 0.7), ("SILENCE_TIMEOUT_SECONDS", 2.0)):
             patch.setattr(supervisor, name, seconds)
         yield
 
@@ -102,7 +102,7 @@ def test_an_infinite_loop_in_a_step_is_reported_and_can_be_interrupted_with_its_
     provoke(file, place, "loop")
     session.do(Step())
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
-    assert place in busy.doing and busy.seconds >= supervisor._BUSY_SECONDS and not busy.ignores_interrupt
+    assert place in busy.doing and busy.seconds >= supervisor.BUSY_SECONDS and not busy.ignores_interrupt
     assert busy.file == str(file) and busy.code in ("while True:", "pass")
     session.do(Step())
     session.do(Step())
@@ -204,7 +204,7 @@ def test_slow_work_is_reported_and_not_stopped(session: Session, file: Path) -> 
     provoke(file, "build", "slow")
     edit(file)
     # Longer than a load waits for uninterruptible work.
-    long = supervisor._LOAD_WAIT_SECONDS + supervisor._SILENCE_TIMEOUT_SECONDS + 0.5
+    long = supervisor.LOAD_WAIT_SECONDS + supervisor.SILENCE_TIMEOUT_SECONDS + 0.5
     busy = wait_until(session, lambda v: v.busy is not None and v.busy.seconds > long, "busy").busy
     assert "build" in busy.doing and busy.code == "_time.sleep(0.1)"
     calm(file)

@@ -52,9 +52,9 @@ def session(
     child_process: None, task_file: Path, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Session]:
     """A session whose worker waits for a debugger before it loads the task."""
-    monkeypatch.setattr(supervisor, "_BUSY_SECONDS", HANG_SECONDS)
-    monkeypatch.setattr(supervisor, "_LOAD_WAIT_SECONDS", HANG_SECONDS)
-    monkeypatch.setattr(supervisor, "_SILENCE_TIMEOUT_SECONDS", HANG_SECONDS)
+    monkeypatch.setattr(supervisor, "BUSY_SECONDS", HANG_SECONDS)
+    monkeypatch.setattr(supervisor, "LOAD_WAIT_SECONDS", HANG_SECONDS)
+    monkeypatch.setattr(supervisor, "SILENCE_TIMEOUT_SECONDS", HANG_SECONDS)
     session = Session(
         str(task_file),
         TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"}),

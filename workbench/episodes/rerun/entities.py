@@ -38,7 +38,7 @@ OBSERVATION = "/observation/state"
 """All observations except pictures as one batch, as in LeRobot. A separate entity for an observation would
 cost 5 kB per file and 40 B per step."""
 
-_MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
+_MAX_PIXELS, MAX_PICTURES = 1 << 20, 1024
 """Maximum pixels and pictures of one chunk, whose pictures are in memory together."""
 _PNG_RGBA = 6
 """Value for RGBA of a PNG's colour type, which is byte 25 of the file (PNG specification, section 11.2.1)."""
@@ -131,7 +131,7 @@ def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
     """(camera, slice of its pictures) of each chunk, in order of time."""
     found = []
     for number, camera in enumerate(cameras):
-        many = min(max(_MAX_PIXELS // (camera.info.width * camera.info.height), 1), _MAX_PICTURES)
+        many = min(max(_MAX_PIXELS // (camera.info.width * camera.info.height), 1), MAX_PICTURES)
         for begin in range(0, len(camera.frame), many):
             found.append((camera.frame[begin], number, slice(begin, begin + many)))
     return [(number, some) for _, number, some in sorted(found, key=lambda piece: piece[:2])]

@@ -94,7 +94,7 @@ class Journal:
             with contextlib.suppress(OSError):  # the first error is raised
                 self.remove()
             raise
-        _journal_threads.watch(self)
+        journal_threads.watch(self)
 
     @property
     def descriptor(self) -> int:
@@ -177,7 +177,7 @@ class Journal:
         Does not sync, because the files replace the journal soon. Retries entries that could not be written; raises OSError
         if they fail again.
         """
-        _journal_threads.remove(self)
+        journal_threads.remove(self)
         self._error = None
         self.write()
         if self._error is not None:
@@ -187,7 +187,7 @@ class Journal:
 
     def close(self) -> None:
         """Close and unlock the file."""
-        _journal_threads.remove(self)
+        journal_threads.remove(self)
         with self._syncing, self._writing:
             self._closer()
 
@@ -314,7 +314,7 @@ class _JournalThreads:
             return list(self._journals)
 
 
-_journal_threads = _JournalThreads()
+journal_threads = _JournalThreads()
 
 
 def before_writing(flush: Callable[[], None]) -> None:
@@ -323,7 +323,7 @@ def before_writing(flush: Callable[[], None]) -> None:
     A caller that batches rows uses this to append them. `flush` runs on the journals' thread and must not
     raise.
     """
-    _journal_threads.flush_first.append(weakref.WeakMethod(flush))
+    journal_threads.flush_first.append(weakref.WeakMethod(flush))
 
 
 class _BoundedFile:

@@ -28,10 +28,10 @@ IDLE_SECONDS = 300.0
 """Time for which an idle process is kept."""
 _STDERR_BYTES = 4096
 """Bytes kept from the end of ``stderr``: the last line is quoted if the process ends with an error."""
-_CANCEL_TIMEOUT_SECONDS = 3.0
-_LOAD_CANCEL_TIMEOUT_SECONDS = 10.0
+CANCEL_TIMEOUT_SECONDS = 3.0
+LOAD_CANCEL_TIMEOUT_SECONDS = 10.0
 """Timeout for the answer to a cancelled load; then the process is ended. For other questions it is
-`_CANCEL_TIMEOUT_SECONDS`."""
+`CANCEL_TIMEOUT_SECONDS`."""
 Value = TypeVar("Value")
 OnProgress = Callable[[int, int, Any], None]
 """Progress callback: gets done, total, and the new part of the answer."""
@@ -198,7 +198,7 @@ class Background(QuestionClient):
         self._turn = None
         if self._unanswered is not None and self._process is not None:
             self._process.send(Cancel())
-            timeout = _LOAD_CANCEL_TIMEOUT_SECONDS if _is_load(self._question) else _CANCEL_TIMEOUT_SECONDS
+            timeout = LOAD_CANCEL_TIMEOUT_SECONDS if _is_load(self._question) else CANCEL_TIMEOUT_SECONDS
             self._overdue = loop.later(timeout, self.end)
         self._grant()
 

@@ -17,7 +17,7 @@ from workbench.machine.processes.child_environment import child_environment, pyt
 from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, has_come, pack
 
-_GPUS = ("/dev/nvidiactl", "/dev/dxg")
+GPU_DEVICES = ("/dev/nvidiactl", "/dev/dxg")
 """If one of these device files exists (the second is that of WSL), CUDA may be available, and no worker is
 forked: CUDA does not work in a fork of a process that has used CUDA, and any import may use it."""
 _MAX_MESSAGE_BYTES = 1 << 12
@@ -135,7 +135,7 @@ class WorkerForks:
             OSError: the process cannot be started.
         """
         with self._lock:
-            control = None if any(map(os.path.exists, _GPUS)) else self._fork_server()
+            control = None if any(map(os.path.exists, GPU_DEVICES)) else self._fork_server()
             if control is not None:
                 try:
                     return _forked(control, fds, niceness)

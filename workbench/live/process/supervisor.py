@@ -34,25 +34,25 @@ from workbench.task.problem import shorten
 
 _POLL_SECONDS = 0.1
 """Interval at which the worker is checked."""
-_BUSY_SECONDS = 2.0
-_SLOW_WORK_SECONDS: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
-"""Time after which slow work (imports, shaders) is reported as busy; for other work it is `_BUSY_SECONDS`."""
-_STACK_PERIOD_SECONDS = 1.0
+BUSY_SECONDS = 2.0
+SLOW_WORK_SECONDS: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
+"""Time after which slow work (imports, shaders) is reported as busy; for other work it is `BUSY_SECONDS`."""
+STACK_PERIOD_SECONDS = 1.0
 """Interval at which the worker's stack is read."""
-_INTERRUPT_TIMEOUT_SECONDS = 1.5
+INTERRUPT_TIMEOUT_SECONDS = 1.5
 """Timeout for the author's code to end after an interrupt."""
-_LOAD_WAIT_SECONDS = 2.0
+LOAD_WAIT_SECONDS = 2.0
 """Time that a load may wait behind other work before this work is interrupted."""
-_SILENCE_TIMEOUT_SECONDS = 4.0
+SILENCE_TIMEOUT_SECONDS = 4.0
 """The worker is ended if the load still waits this long after the interrupt."""
-_RESTART_DELAY_SECONDS = 0.5
-_HEADLESS_SECONDS = 1.0
+RESTART_DELAY_SECONDS = 0.5
+HEADLESS_SECONDS = 1.0
 """Time without a main thread after which a worker is ended; an exiting process has no main thread for a
 moment."""
 _MAX_DEATHS = 3
 """After this many deaths of workers in a row, without a load in between, the next worker is started only on
 request."""
-_SPARE_DELAY_SECONDS = 5.0
+SPARE_DELAY_SECONDS = 5.0
 """Time between a load and the start of a spare."""
 _MAX_SPARE_FAILURES = 2
 """When this many spares have died, no more are started."""
@@ -128,9 +128,9 @@ class SpareWorker:
         self._due: float | None = None
 
     def begin_soon(self) -> None:
-        """Start a spare after `_SPARE_DELAY_SECONDS`, if there is none."""
+        """Start a spare after `SPARE_DELAY_SECONDS`, if there is none."""
         if self._process is None and self._due is None and self._failures < _MAX_SPARE_FAILURES:
-            self._due = time.monotonic() + _SPARE_DELAY_SECONDS
+            self._due = time.monotonic() + SPARE_DELAY_SECONDS
 
     def poll(self) -> None:
         """Start a spare if it is due, and read its events. Does not block."""
@@ -339,7 +339,7 @@ class Supervisor:
         with self._condition:
             # Without a delay, a failure that repeats at once would use up all attempts.
             self._condition.wait_for(
-                lambda: self._replace_asked or self._closing, None if gives_up else _RESTART_DELAY_SECONDS
+                lambda: self._replace_asked or self._closing, None if gives_up else RESTART_DELAY_SECONDS
             )
             return not self._closing
 
@@ -457,7 +457,7 @@ class Supervisor:
             state.headless_since = None
         elif state.headless_since is None:
             state.headless_since = now
-        elif now - state.headless_since > _HEADLESS_SECONDS:
+        elif now - state.headless_since > HEADLESS_SECONDS:
             state.why = "was ended because its main thread had ended and left another thread running,"
             self._end(worker, state)
         self._check_memory(worker, state)
@@ -468,27 +468,27 @@ class Supervisor:
         if (
             load_sent is not None
             and not beat.held
-            and beat.doing not in _SLOW_WORK_SECONDS
+            and beat.doing not in SLOW_WORK_SECONDS
             and beat.since < load_sent
         ):
             waited = now - max(load_sent, state.held_changed)
             # Count from the interrupt: an interrupted load needs time to close what it built.
             ignored = self._since_interrupt(beat)
-            if waited > _LOAD_WAIT_SECONDS and ignored is None:
+            if waited > LOAD_WAIT_SECONDS and ignored is None:
                 self.interrupt()
-            elif waited > _LOAD_WAIT_SECONDS and ignored is not None and ignored > _SILENCE_TIMEOUT_SECONDS:
+            elif waited > LOAD_WAIT_SECONDS and ignored is not None and ignored > SILENCE_TIMEOUT_SECONDS:
                 state.why = f"did not answer for {waited:.0f} s"
                 state.end = End.FILE_WAITS
                 self._end(worker, state)
         seconds = min(beat.seconds, now - state.held_changed)
-        if not beat.held and seconds < _SLOW_WORK_SECONDS.get(beat.doing, _BUSY_SECONDS):
+        if not beat.held and seconds < SLOW_WORK_SECONDS.get(beat.doing, BUSY_SECONDS):
             if state.reported is not None:
                 state.reported = None
                 self._on_busy(None)
-        elif state.reported is None or now - state.reported >= _STACK_PERIOD_SECONDS:
+        elif state.reported is None or now - state.reported >= STACK_PERIOD_SECONDS:
             state.reported = now
             self._read_stack(worker, state, beat)
-            ignores_interrupt = (self._since_interrupt(beat) or 0.0) > _INTERRUPT_TIMEOUT_SECONDS
+            ignores_interrupt = (self._since_interrupt(beat) or 0.0) > INTERRUPT_TIMEOUT_SECONDS
             own, texts = self._own_files(), self._texts(beat.doing == "loading")
             self._on_busy(busy_at(seconds, beat.doing, state.stack, own, ignores_interrupt, beat.held, texts))
 
