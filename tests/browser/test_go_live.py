@@ -52,11 +52,6 @@ COUNT_BODIES = """() => {
 }"""
 
 
-def timeline_width(page: Page) -> float:
-    panel = "document.querySelector('.wb-timeline')?.closest('.mantine-Paper-root')"
-    return page.evaluate(f"() => {panel}?.getBoundingClientRect().width ?? 0")
-
-
 @pytest.mark.slow
 def test_a_recording_is_rescored_and_entered_with_todays_and_with_its_own_code(
     address: str, author: Path, browser: Browser
@@ -75,8 +70,6 @@ def test_a_recording_is_rescored_and_entered_with_todays_and_with_its_own_code(
         page.get_by_role("tab", name="Review").click()
         page.keyboard.press("ArrowRight")
         expect(page.get_by_text("step 2 / 15").first).to_be_visible()
-        # The open library leaves little room for the timeline.
-        until(lambda: timeline_width(page) < 500, "the narrow timeline")
         page.evaluate(COUNT_BODIES)
         live.click()
         expect(page.get_by_text("loading WorkbenchPushCube-v1 at step 2")).to_be_visible()
@@ -87,7 +80,6 @@ def test_a_recording_is_rescored_and_entered_with_todays_and_with_its_own_code(
         )
         expect(status).to_be_visible(timeout=TIMEOUT_MS)
         assert page.evaluate("window.fewest") > 5, "the view was empty for a while"
-        until(lambda: timeline_width(page) > 700, "the wide timeline")
         expect(status).to_contain_text("to the last bit")
         expect(page.get_by_role("button", name="undo going live")).to_be_visible()
 
