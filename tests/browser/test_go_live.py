@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
-from tests.drive.waiting import until
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions
 from workbench.task.description import TaskOptions
