@@ -180,11 +180,14 @@ def test_changed_scene_attributes_return_to_that_envs_built_values() -> None:
 
 
 def test_batch_wide_attributes_are_restored_only_with_all_envs(env: Any) -> None:
+    env.kept_tensor, env.written_tensor = torch.ones(3), torch.tensor(1)
     snapshot, count = take_snapshot(env), env.total_resets
     env.total_resets += 5
+    env.written_tensor += 1
     report = restore_snapshot(env, snapshot, [0, 1])
     assert env.total_resets == count + 5
     assert "whole batch" in report.not_carried["total_resets"]
+    assert "written_tensor" in report.not_carried and "kept_tensor" not in report.not_carried
     report = restore_snapshot(env, snapshot, range(N), source=2)
     assert env.total_resets == count and "total_resets" not in report.not_carried
     env.total_resets += 5

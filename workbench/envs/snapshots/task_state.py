@@ -177,7 +177,7 @@ def write_task_state(
             elif all_envs:
                 leaf.put(_whole_value(kept, env))
                 carried[leaf.path] = None
-            elif not _equal(kept.values, value):
+            elif not kept.is_as(_kept(value, env.num_envs)):
                 missed[leaf.path] = "it holds for the whole batch, and not all envs were restored"
             continue
         new = _with_rows(value, kept, env, env_idx, chosen, all_envs)
