@@ -85,12 +85,12 @@ def task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder / "far.py"
 
 
-def wanted(out: str, **other: Any) -> RecordOptions:
+def wanted(out: str, episodes: int = 8, **other: Any) -> RecordOptions:
     options = TaskOptions(num_envs=2, seed=3, env_kwargs=PLAIN)
     return RecordOptions(
         "mine/far.py",
         Path(out),
-        8,
+        episodes,
         pictures=False,
         max_steps=6,
         actions="mine/still.py:act",
@@ -152,7 +152,8 @@ def test_a_killed_worker_loses_and_duplicates_no_episode(
 
 
 def test_a_stopped_job_leaves_complete_episodes_and_is_resumed(address: str, task: Path) -> None:
-    here, asked = bits(record(wanted("here"))), wanted("there")
+    # So many that the stop, which is asked for at the end of the first, comes before that of the last.
+    here, asked = bits(record(wanted("here", 64))), wanted("there", 64)
     over = threading.Event()
 
     def run(stop: Callable[[], bool], on_progress: Callable[[Any], None]) -> Recorded:
@@ -174,10 +175,10 @@ def test_a_stopped_job_leaves_complete_episodes_and_is_resumed(address: str, tas
             over.set()
 
     first = run(over.is_set, on_progress)
-    assert first.stopped and 0 < len(first.written) < 8
+    assert first.stopped and 0 < len(first.written) < 64
     assert len(list(Path("there").glob("*.json"))) == len(first.written)
     second = run(lambda: False, lambda progress: None)
-    assert bits(second) == here and len(list(Path("there").glob("*.json"))) == 8
+    assert bits(second) == here and len(list(Path("there").glob("*.json"))) == 64
 
 
 def test_failed_seeds_are_reported_with_the_local_line_and_the_others_are_kept(
