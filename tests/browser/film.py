@@ -78,7 +78,7 @@ def take_film(desk: Desk, path: Path) -> None:
     """The page plays a policy that overshoots in every fifth env."""
     film, page = Film(desk), desk.page
     desk.tab("Reward")
-    desk.press("Space")
+    desk.press("o", "f", "Space")  # all envs
     time.sleep(4)
     film.scene("Sixteen environments run your file", 3.0, 9)
     film.scene("Change the reward and save", 1.5, 2, code=REWARD)
