@@ -52,6 +52,8 @@ def test_a_test_without_the_fixture_for_what_it_uses_fails_and_names_it(
 ) -> None:
     (tmp_path / "conftest.py").write_text('pytest_plugins = ["tests.drive.tiers"]\n')
     (tmp_path / "test_all.py").write_text(TESTS)
+    for name, marks in (("one", "pytest.mark.slow"), ("more", "[\n    pytest.mark.browser,\n]")):
+        (tmp_path / f"test_{name}.py").write_text(f"import pytest\npytestmark = {marks}\nraise ImportError")
     markers = "browser process render slow".split()
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  " + "\n  ".join(markers))
     output = subprocess.run(

@@ -6,8 +6,10 @@ In that run a test that starts a process or renders fails with the name of the f
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +18,9 @@ from tests.drive import waiting
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 MARKER_OF = {"chromium_path": "browser", "child_process": "process", "renderer": "render"}
+LEFT_OUT = (*MARKER_OF.values(), "thorough", "slow")
+ALL_TESTS_MARKED = re.compile(r"^pytestmark = (\[$[\s\S]*?^\]|.*)", re.MULTILINE)
+LEFT_OUT_MARK = re.compile(rf"\bmark\.({'|'.join(LEFT_OUT)})\b|\"({'|'.join(MARKER_OF)})\"")
 STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.spawn", "os.system"}
 
 
@@ -106,11 +111,17 @@ class Guard:
         if self.refused:
             pytest.fail(self.refused[0])
 
+    def pytest_ignore_collect(self, collection_path: Path) -> bool | None:
+        """Do not import a file of which all tests are left out: a third of them, and they import the most."""
+        if collection_path.suffix != ".py":
+            return None
+        mark = ALL_TESTS_MARKED.search(collection_path.read_text())
+        return True if mark and LEFT_OUT_MARK.search(mark[0]) else None
+
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
-        left_out = (*MARKER_OF.values(), "thorough", "slow")
         fast, others = [], []
         for item in items:
-            (others if any(map(item.get_closest_marker, left_out)) else fast).append(item)
+            (others if any(map(item.get_closest_marker, LEFT_OUT)) else fast).append(item)
         config.hook.pytest_deselected(items=others)
         items[:] = fast
 
