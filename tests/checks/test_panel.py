@@ -96,7 +96,10 @@ def test_a_finding_has_rule_degree_line_code_and_message_as_text_and_the_tab_cou
         'data-copy="# workbench: off[success-at-reset] "',
     ):
         assert words in text
-    assert "1 stop, 1 kept, 1 not applicable" in checks.live.html()
+    assert "1 stop, 1 kept, 1 not applicable" in checks.live.html() and "2 rules without a finding" in text
+    with_failed = (*RESULTS, RuleResult("entry-name", "failed", why="our own mistake"))
+    assert "2 rules without a finding" in checks.draw(replace(DONE, results=with_failed))
+    checks.draw()
     assert checks.tab == "Checks 1" and checks.marked == 1
     assert "push.py:88" in checks.live.html("wb-rules-mark")
     code = replace(FOUND, message="`evaluate` gives `a<b>`, and ` alone")

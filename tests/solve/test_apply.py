@@ -320,6 +320,7 @@ def test_a_press_on_a_seed_opens_its_recording(
     panel.draw(played.view)
     assert all(panels.presses(ShowSolved(seed=seed)) for seed in (0, 1, 2))
     assert "it fell" in panels.html()
+    assert any("2 of 3 solved" in fold for fold in panels.folders())
 
 
 def episode(seed: int, success: Sequence[int], cut_off: bool = False) -> PlannedEpisode:

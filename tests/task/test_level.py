@@ -319,6 +319,7 @@ def test_cameras_that_depend_on_the_current_state_rebuild(hook: str) -> None:
 def test_a_file_that_cannot_be_read_is_no_error() -> None:
     assert change("def (", task("def evaluate(self):\n    return {}\n")).level == "rebuilt"
     assert change(task("x = 1\n"), "class Task(BaseEnv):\n    x = 1\n" + "\0").level == "rebuilt"
+    assert change(task("x = 1\n"), task("x = 1\n") + "y = " + 3000 * "-" + "1\n").level == "rebuilt"
 
 
 @pytest.mark.parametrize(

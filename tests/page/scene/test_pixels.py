@@ -1,9 +1,19 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.page.scene.visible_motion import AT_REST_SECONDS, Eye, SentPoses, displacements, pixel_sizes
+from workbench.page.scene.visible_motion import (
+    AT_REST_SECONDS,
+    Eye,
+    SentPoses,
+    displacements,
+    eyes_of,
+    pixel_sizes,
+)
 
 EYE = Eye(np.array([0.0, 0.0, 5.0]), 0.001)
 """A pixel is 5 mm at the origin."""
@@ -85,3 +95,10 @@ def test_an_appearing_or_disappearing_body_is_sent() -> None:
     assert changed[3] and not np.delete(changed, 3).any() and np.isnan(shown[3]).all()
     shown, changed = sent.update(poses_at(0.0), (EYE,), 0.06)
     assert changed[3] and np.isfinite(shown).all()
+
+
+def test_a_page_that_folded_its_view_has_an_eye() -> None:
+    camera = SimpleNamespace(position=np.zeros(3), fov=1.0, image_height=0)
+    server: Any = SimpleNamespace(get_clients=lambda: {0: SimpleNamespace(camera=camera)})
+    (eye,) = eyes_of(server)
+    assert np.isfinite(eye.pixel)
