@@ -22,6 +22,8 @@ from workbench.envs.arms import Arm, find_arms, reaches, solve, steer, without_a
 from workbench.envs.maniskill_private import apply_and_fetch, objects_of
 from workbench.envs.task_env import TaskEnv
 
+pytestmark = pytest.mark.thorough
+
 ENV = 1
 WAY = np.array([-0.03, 0.04, 0.05, 0, 0, 0, 0])
 

@@ -19,6 +19,8 @@ from workbench.record.state import RecordingStatus, RecordingWanted
 from workbench.task.problem import Problem
 from workbench.task.watch import SourceWatcher
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture
 def disk() -> Iterator[threading.Event]:
