@@ -12,13 +12,14 @@ from typing import Any, cast
 import pytest
 
 from tests.drive.scenes import problem
-from tests.drive.session import FakeWorker, FakeWorkerSession, fake_worker_session, wait_until
+from tests.drive.session import DEATH, FakeWorker, FakeWorkerSession, fake_worker_session, wait_until
 from tests.drive.waiting import until
 from workbench.checks.commands import CheckAfterSave
 from workbench.checks.state import ChecksView
 from workbench.live.commands import Interrupt, SetSeed, Step
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest, EnterRecording, Event, Load, TaskFailed
+from workbench.live.process.supervisor import End
 from workbench.machine.kept_choices import kept_choices
 from workbench.task.description import TaskOptions
 
@@ -185,3 +186,14 @@ def test_the_log_can_be_cleared(tmp_path: Path) -> None:
         until(lambda: lines, "the line in the terminal")
         session.clear_printed()
         assert session.view().printed.texts == ()
+
+
+def test_a_worker_that_hands_over_repeats_no_earlier_problem(tmp_path: Path) -> None:
+    told: list[Event] = []
+    with fake_worker_session(tmp_path, on_event=told.append) as fake:
+        fake.load()
+        fake.tell(TaskFailed(problem(), kept=True))
+        fake.die(replace(DEATH, end=End.HANDED_OVER))
+        assert sum(isinstance(event, TaskFailed) for event in told) == 1
+        fake.die()
+        assert sum(isinstance(event, TaskFailed) for event in told) == 2
