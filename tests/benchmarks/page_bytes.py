@@ -96,7 +96,7 @@ class Player(ScriptedWorker):
     def show(self, number: int) -> None:
         step, begins = self._played.steps[number]
         count = self._played.task.num_envs
-        self._tell(
+        self.tell(
             Stepped(
                 step,
                 np.full(count, begins),
@@ -107,7 +107,7 @@ class Player(ScriptedWorker):
             )
         )
         if number % 20 == 0:
-            self._tell(Status(True, 80.0, SPEED))
+            self.tell(Status(True, 80.0, SPEED))
 
     def _at(self, poses: np.ndarray, elapsed: np.ndarray) -> StepResult:
         return self._played.first
