@@ -72,8 +72,6 @@ open: set-up
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
 	exec $(BIN)/workbench open $(TASK) $(ARGS)
 
-# The types of the tests are two fifths of pyright's time: `make lint` and `make test-all` check them.
-test: TYPED := workbench tasks
 test: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
@@ -111,7 +109,7 @@ lint: set-up-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 # The types are those of the release.
-	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright --threads $(WORKERS) $(TYPED))
+	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright --threads $(WORKERS))
 
 wheel: set-up-test
 	$(BIN)/python -m build --wheel
