@@ -236,6 +236,8 @@ def test_the_dialog_opens_once_and_closes_on_a_choice(panels: Panels, chosen: Ch
     dialog.draw(None)
     assert "push.py" in panels.html("wb-tasks")
     panels.do(OpenTaskList())
+    panels.do(OpenListedTask(number=push))
+    assert chosen.numbers == [push], "the dialog is closed, though it is still on the page"
     dialog.draw(None)
     assert panels.html("wb-tasks") == "", "the key that opened the dialog closes it"
 
