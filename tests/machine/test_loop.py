@@ -86,8 +86,12 @@ def test_an_error_of_a_change_is_raised_or_reported(reports: list[str]) -> None:
 
 def test_posted_changes_run_in_order_and_a_timer_can_be_cancelled() -> None:
     order: list[Any] = []
-    timers = do(lambda: [later(0.01, lambda k=k: order.append(k)) for k in ("kept", "cancelled")])
-    do(timers[1].cancel)
+
+    def begin() -> None:
+        later(0.01, lambda: order.append("kept"))
+        later(0.01, lambda: order.append("cancelled")).cancel()
+
+    do(begin)
     for number in range(50):
         post(lambda number=number: order.append(number))
     do(lambda: None)
