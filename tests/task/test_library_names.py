@@ -10,7 +10,6 @@ import pytest
 from tests.drive.task_files import Write
 from workbench.actions.policy import load_policy
 from workbench.task.load import load_task
-from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.thorough
 
@@ -63,24 +62,6 @@ def test_a_task_file_may_have_the_name_of_a_library(write: Write, name: str) -> 
     assert seen is not sys.modules[task.cls.__module__] and (library is None or seen is library)
     path.write_text(path.read_text() + "\nNEXT = 1\n")
     assert sys.modules[load_task(str(path)).cls.__module__].NEXT == 1
-
-
-def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Write) -> None:
-    path_before, finders = list(sys.path), list(sys.meta_path)
-    plant(write, "numpy")
-    path = write(
-        "push.py", "import sys\nsys.path.insert(0, '/nowhere')\nsys.path.append('/elsewhere')\n1 / 0\n"
-    )
-    with pytest.raises(TaskError):
-        load_task(str(path))
-    assert (sys.path, sys.meta_path) == (path_before, finders)
-    good = write("good.py", TASK, task=True)
-    load_task(str(good))
-    assert sys.path[0] == str(good.parent)
-    before = list(sys.path), list(sys.meta_path)
-    with pytest.raises(TaskError):
-        load_task(str(path))
-    assert (sys.path, sys.meta_path) == before
 
 
 def test_a_policy_imports_modules_beside_it_but_never_in_place_of_a_library(
