@@ -83,20 +83,6 @@ def test_computed_imports_count_all_neighbour_files_and_are_reported(tmp_path: P
     assert any("task.py:" in what and "other code" in what for what in content.unseen)
 
 
-def test_the_hash_depends_on_the_texts_and_not_on_their_location(tmp_path: Path) -> None:
-    here = lay(tmp_path / "here", task="import alone")
-    (tmp_path / "here" / "alone.py").write_text("A = 1\n")
-    there = tmp_path / "there" / "task.py"
-    there.parent.mkdir()
-    for name in ("task.py", "alone.py"):
-        (there.parent / name).write_bytes((here.parent / name).read_bytes())
-    assert read_content(here).hash == read_content(there).hash
-    (there.parent / "unused.py").write_text("A = 3\n")
-    assert read_content(here).hash == read_content(there).hash
-    (there.parent / "alone.py").write_text("A = 2\n")
-    assert read_content(here).hash != read_content(there).hash
-
-
 def test_files_that_are_not_ordinary_text_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.py")
     (tmp_path / "zero.py").symlink_to("/dev/zero")
@@ -198,6 +184,9 @@ def test_sums_are_those_of_the_files_and_the_hash_that_of_the_texts(tmp_path: Pa
     assert list(unix.file_sums) == ["task.py", "alone.py"] and unix.hash == dos.hash
     assert dos.file_sums["alone.py"] == hashlib.sha256(b"A = 1\r\nB = 2\r\n").hexdigest()
     assert unix.file_sums["alone.py"] != dos.file_sums["alone.py"]
+    assert content_of("edited", b"A = 1\nB = 3\n").hash != unix.hash
+    (tmp_path / "unix" / "unused.py").write_text("A = 3\n")
+    assert read_content(tmp_path / "unix" / "task.py").hash == unix.hash
     assert dos.texts[str(tmp_path / "dos" / "alone.py")] == "A = 1\nB = 2\n"
     recorded = TaskContent("task.py", {"task.py": "x\n", "alone.py": "y\n"})
     assert recorded.file_sums == {name: hashlib.sha256(text).hexdigest() for name, text in (("task.py", b"x\n"), ("alone.py", b"y\n"))}  # fmt: skip
