@@ -4,32 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401
 import pytest
 from mani_skill import agents
-from mani_skill.agents import registration as agent_registration
 from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils import assets
 from mani_skill.utils import registration as env_registration
 
 from tests.task.registered import TABLES, registered
 from workbench.task import registry
 
 THIS_FILE = __file__
-
-
-def test_the_registries_are_those_that_upstream_reads() -> None:
-    ours = [id(table) for table in registry._TABLES]
-    assert ours == [
-        id(env_registration.REGISTERED_ENVS),
-        id(gym.registry),
-        id(agent_registration.REGISTERED_AGENTS),
-        id(assets.DATA_GROUPS),
-    ]
-    assert agents.REGISTERED_AGENTS is agent_registration.REGISTERED_AGENTS
-    assert ours == [id(table) for table in TABLES], "TABLES must be the registries that the tests check"
 
 
 def test_registering_writes_only_the_restored_registries() -> None:
