@@ -1,4 +1,4 @@
-"""A robot file on a real env: the robot moves, and a save rebuilds it."""
+"""A file with a robot and no task: the robot is shown in an empty scene, a message says so, and a save rebuilds it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mani_skill.agents.registration import REGISTERED_AGENTS
 
+from tests.drive.task_files import Write
+from tests.task.refusal import refused
 from workbench.envs import action_vector as actions
 from workbench.episodes.reader import reading
 from workbench.episodes.reader.scan import scan_folder
@@ -17,7 +20,55 @@ from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions
 from workbench.rescore.replay_recordings import rescore
 from workbench.task.description import TaskOptions
+from workbench.task.load import load_task, undo_load
 from workbench.task.open import open_task
+
+ROBOTS = """
+from mani_skill.agents.registration import register_agent
+from mani_skill.agents.robots import Panda, PandaWristCam
+
+@register_agent()
+class TallPanda(Panda):
+    uid = "tall_panda"
+
+@register_agent()
+class SmallPanda(Panda):
+    uid = "small_panda"
+    size = 1
+"""
+
+
+def test_a_robot_file_opens_in_an_empty_scene_with_a_message(write: Write) -> None:
+    file = write("arms.py", ROBOTS)
+    task = load_task(str(file))
+    assert (task.env_id, task.chosen, task.others) == ("Empty-v1", "SmallPanda", ("TallPanda",))
+    assert task.default_kwargs == {"robot_uids": "small_panda"}
+    assert (task.file, task.followed) == (file, True)
+    (notice,) = task.notices
+    assert "SmallPanda, with the uid 'small_panda'" in notice
+    assert (
+        f"type in {file.parent}: workbench open PickCube-v1 --import arms --env robot_uids=small_panda"
+        in notice
+    )
+    other = load_task(f"{file}:TallPanda")
+    assert (other.chosen, other.default_kwargs) == ("TallPanda", {"robot_uids": "tall_panda"})
+    assert not undo_load(task) and undo_load(other)
+
+
+@pytest.mark.parametrize("text", ["raise SystemExit\n", "1 / 0\n"])
+def test_a_version_that_fails_keeps_the_previous_robot(write: Write, text: str) -> None:
+    file = write("arms.py", ROBOTS)
+    load_task(str(file))
+    before = REGISTERED_AGENTS["small_panda"].agent_cls
+    file.write_text(ROBOTS + text)
+    refused(file)
+    assert REGISTERED_AGENTS["small_panda"].agent_cls is before
+    file.write_text(ROBOTS.replace("size = 1", "size = 2"))
+    load_task(str(file))
+    assert vars(REGISTERED_AGENTS["small_panda"].agent_cls)["size"] == 2
+
+
+# --- on a real env ---
 
 ROBOT = """
 from mani_skill.agents.registration import register_agent
