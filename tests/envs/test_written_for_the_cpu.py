@@ -72,6 +72,20 @@ class TargetsWhileBuilt(Written):
         self.see(targets=self.chain.drive_targets, velocities=self.chain.drive_velocities)
 
 
+class TargetsAfterTheBuild(TargetsWhileBuilt):
+    def _after_reconfigure(self, options: dict) -> None:
+        self.chain.set_joint_drive_targets(
+            self.per_env(None, (0.4, 0.2), (0.1, 0.3)), self.chain.active_joints
+        )
+        self.second_joint.set_drive_velocity_target(0.2)
+
+
+class TargetsInReset(TargetsWhileBuilt):
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        targets = self.per_env(env_idx, (0.4, 0.2), (0.1, 0.3))
+        self.chain.set_joint_drive_targets(targets, joints=self.chain.active_joints)
+
+
 class StepsWhileBuilt(Written):
     def built(self) -> None:
         for _ in range(5):
@@ -239,7 +253,8 @@ class RemovesABody(Written):
 
 
 TASKS = [
-    *(ReadsWhileBuilt, WritesWhileBuilt, TargetsWhileBuilt, StepsWhileBuilt, SettlesInReset),
+    *(ReadsWhileBuilt, WritesWhileBuilt, TargetsWhileBuilt, TargetsAfterTheBuild, TargetsInReset),
+    *(StepsWhileBuilt, SettlesInReset),
     *(StepsTheEnvInReset, StepsAfterReset, ReadsLinksInReset, WritesInEvaluate),
     *(WritesAndReadsBetweenSubsteps, MovesAStaticActor, WritesPastTheTensors, ReadsPastTheTensors),
     *(GivesRowsOfAllEnvs, SetsJointsOneByOne, ChangesWhatIsFixedOnTheGpu, ComputesPassiveForces),
