@@ -90,68 +90,6 @@ def new_velocity(env: Any) -> None:
     env.apply()
 
 
-LOADS = {
-    "mass": lambda env: env.a.set_mass(20.0),
-    "mass of every body": mass_of_every_body,
-    "no gravity": lambda env: env.a.set_disable_gravity(True),
-    "no gravity for links": lambda env: [link.set_disable_gravity(True) for link in env.chain.links],
-    "linear damping": lambda env: env.a.set_linear_damping(5.0),
-    "angular damping": lambda env: env.a.set_angular_damping(50.0),
-    "locked axes": lambda env: env.a.set_locked_motion_axes([False, True, False, True, True, True]),
-    "friction": friction_of_every_shape,
-    "no collision": no_collision_between_the_boxes,
-    "drive between actors": drive_between_actors,
-    "drive between a link and an actor": drive_between_a_link_and_an_actor,
-    "joint drives": joint_drives,
-    "joint friction and limits": joint_properties,
-}
-STEP_CHANGES = {
-    "force": push,
-    "joint forces": joint_forces,
-    "velocities": new_velocity,
-}
-
-
-def outcome(env: Any) -> torch.Tensor:
-    return env.get_state()
-
-
-@pytest.fixture(scope="module")
-def unchanged() -> torch.Tensor:
-    env = follow(Collision, steps=STEPS)
-    state = outcome(env)
-    env.close()
-    return state
-
-
-@pytest.mark.parametrize("change", LOADS)
-def test_a_change_while_loading(change: str, unchanged: torch.Tensor) -> None:
-    task = type("Changed", (Collision,), {"on_load": staticmethod(LOADS[change])})
-    env = follow(task, steps=STEPS)
-    assert bool(((outcome(env) - unchanged).abs() > 1e-4).any(dim=1).all()), "the change changed nothing"
-    env.close()
-
-
-@pytest.mark.parametrize("change", STEP_CHANGES)
-def test_a_change_on_every_control_step(change: str, unchanged: torch.Tensor) -> None:
-    task = type("Changed", (Collision,), {"on_step": staticmethod(STEP_CHANGES[change])})
-    env = follow(task, steps=STEPS)
-    assert bool(((outcome(env) - unchanged).abs() > 1e-4).any(dim=1).all()), "the change changed nothing"
-    env.close()
-
-
-def test_drive_targets_and_velocity_targets() -> None:
-    task = type(
-        "Changed",
-        (Collision,),
-        {"on_load": staticmethod(joint_drives), "on_step": staticmethod(drive_targets)},
-    )
-    env = follow(task, steps=STEPS)
-    assert torch.equal(env.chain.drive_targets, torch.full((3, 2), -0.5))
-    assert torch.equal(env.chain.drive_velocities, torch.full((3, 2), 0.1))
-    env.close()
-
-
 SIM_CONFIGS = {
     "frequencies": SimConfig(sim_freq=240, control_freq=40),
     "gravity": SimConfig(scene_config=SceneConfig(gravity=np.array([0.0, 1.0, -3.0]))),
@@ -159,14 +97,54 @@ SIM_CONFIGS = {
     "contact offset": SimConfig(scene_config=SceneConfig(contact_offset=0.001, bounce_threshold=0.1)),
     "solver kind": SimConfig(scene_config=SceneConfig(enable_tgs=False, enable_pcm=False)),
 }
+CHANGES: dict[str, dict[str, Any]] = {
+    "mass": {"on_load": lambda env: env.a.set_mass(20.0)},
+    "mass of every body": {"on_load": mass_of_every_body},
+    "no gravity": {"on_load": lambda env: env.a.set_disable_gravity(True)},
+    "no gravity for links": {
+        "on_load": lambda env: [link.set_disable_gravity(True) for link in env.chain.links]
+    },
+    "linear damping": {"on_load": lambda env: env.a.set_linear_damping(5.0)},
+    "angular damping": {"on_load": lambda env: env.a.set_angular_damping(50.0)},
+    "locked axes": {
+        "on_load": lambda env: env.a.set_locked_motion_axes([False, True, False, True, True, True])
+    },
+    "friction": {"on_load": friction_of_every_shape},
+    "no collision": {"on_load": no_collision_between_the_boxes},
+    "drive between actors": {"on_load": drive_between_actors},
+    "drive between a link and an actor": {"on_load": drive_between_a_link_and_an_actor},
+    "joint drives": {"on_load": joint_drives},
+    "joint friction and limits": {"on_load": joint_properties},
+    "force": {"on_step": push},
+    "joint forces": {"on_step": joint_forces},
+    "velocities": {"on_step": new_velocity},
+    "drive targets": {"on_load": joint_drives, "on_step": drive_targets},
+    **{
+        name: {"_default_sim_config": property(lambda self, config=config: config)}
+        for name, config in SIM_CONFIGS.items()
+    },
+}
 
 
-@pytest.mark.parametrize("change", SIM_CONFIGS)
-def test_the_simulation_config_reaches_every_env(change: str, unchanged: torch.Tensor) -> None:
-    config = SIM_CONFIGS[change]
-    task = type("Configured", (Collision,), {"_default_sim_config": property(lambda self: config)})
-    env = follow(task, steps=STEPS)
-    assert bool(((outcome(env) - unchanged).abs() > 1e-6).any(dim=1).all()), "the config changed nothing"
+@pytest.fixture(scope="module")
+def unchanged() -> torch.Tensor:
+    env = follow(Collision, steps=STEPS)
+    state = env.get_state()
+    env.close()
+    return state
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_setting_changes_the_motion_of_every_env_as_in_a_stock_env(
+    change: str, unchanged: torch.Tensor
+) -> None:
+    members = {name: f if isinstance(f, property) else staticmethod(f) for name, f in CHANGES[change].items()}
+    env = follow(type("Changed", (Collision,), members), steps=STEPS)
+    least = 1e-6 if change in SIM_CONFIGS else 1e-4
+    assert bool(((env.get_state() - unchanged).abs() > least).any(dim=1).all()), "the change changed nothing"
+    if change == "drive targets":
+        assert torch.equal(env.chain.drive_targets, torch.full((3, 2), -0.5))
+        assert torch.equal(env.chain.drive_velocities, torch.full((3, 2), 0.1))
     env.close()
 
 
