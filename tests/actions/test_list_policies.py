@@ -41,36 +41,33 @@ def test_functions_of_one_required_parameter_are_listed_those_of_an_observation_
     assert list_policies(tmp_path, None) == ("lab.py:act", "lab.py:positional", "lab.py:helper")
 
 
-def test_what_is_beside_the_task_is_listed_as_it_is_found(tmp_path: Path, monkeypatch) -> None:
+@pytest.fixture
+def task_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a task, with a policy of the same name as one in the current folder, and another one."""
     here, task = tmp_path / "here", tmp_path / "task"
     for folder in (here, task):
         folder.mkdir()
-        (folder / "same.py").write_text("def act(obs): ...\n")
-    (task / "other.py").write_text("def act(obs): ...\n")
+        (folder / "a.py").write_text("def act(obs): ...\n")
+    (task / "b.py").write_text("def act(obs): ...\n")
     monkeypatch.chdir(here)
-    listed = list_policies(here, task)
-    assert listed == ("same.py:act", "other.py:act", f"{task}/same.py:act")
-    assert [find_policy(one, task)[0] for one in listed] == [
-        here / "same.py",
-        task / "other.py",
-        task / "same.py",
-    ]
-    assert list_policies(here, here) == ("same.py:act",)
+    return task
 
 
-def test_a_file_is_found_here_before_it_is_found_beside_the_task(tmp_path: Path, monkeypatch) -> None:
-    here, task = tmp_path / "here", tmp_path / "task"
-    for folder in (here, task):
-        folder.mkdir()
-        (folder / "a.py").write_text(POLICIES)
-    (task / "b.py").write_text(POLICIES)
-    monkeypatch.chdir(here)
-    found = {"a.py:act": here / "a.py", "b.py:act": task / "b.py", f"{task}/a.py:act": task / "a.py"}
-    assert {one: find_policy(one, task) for one in found} == {one: (at, "act") for one, at in found.items()}
-    assert find_policy("lab.act:act", task) == ("lab.act", "act")
+def test_what_is_beside_the_task_is_listed_as_it_is_found(task_folder: Path) -> None:
+    here = task_folder.with_name("here")
+    listed = list_policies(here, task_folder)
+    assert listed == ("a.py:act", f"{task_folder}/a.py:act", "b.py:act")
+    files = here / "a.py", task_folder / "a.py", task_folder / "b.py"
+    assert [find_policy(one, task_folder) for one in listed] == [(file, "act") for file in files]
+    assert list_policies(here, here) == ("a.py:act",)
+
+
+def test_a_module_is_named_and_a_missing_policy_is_refused(task_folder: Path) -> None:
+    assert find_policy("lab.act:act", task_folder) == ("lab.act", "act")
+    here = task_folder.with_name("here")
     for missing in ("c.py:act", f"{here}/b.py:act", "a.py", ":act", "a.py:", " "):
         with pytest.raises(NoPolicy):
-            find_policy(missing, task)
+            find_policy(missing, task_folder)
     with pytest.raises(NoPolicy):
         find_policy("b.py:act")
 
