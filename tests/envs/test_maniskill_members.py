@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+import copy
+import inspect
+import sys
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -107,6 +110,36 @@ def test_a_config_has_the_target_of_its_look_at_and_is_noted() -> None:
     assert [config for config, _ in noted] == made
     targets = [private.camera_target(config) for config in made]
     assert [None if target is None else [*target] for target in targets] == [[0, 0, 0.0], [0, 0, 0.5], None]
+
+
+def test_a_config_knows_where_it_was_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Running an author's hooks patches the class for the rest of the process: restore ManiSkill's own.
+    stock = getattr(CameraConfig.__init__, "_workbench_stock", CameraConfig.__init__)
+    monkeypatch.setattr(CameraConfig, "__init__", stock)
+    monkeypatch.setattr(sapien_utils, "look_at", sapien_utils.look_at)  # restored after the test
+    private.mark_camera_configs()
+    private.mark_camera_configs()
+
+    def hook() -> list[CameraConfig]:
+        pose = sapien.Pose()
+        return [
+            CameraConfig("a", pose, 8, 6, fov=1.0),
+            CameraConfig(
+                "b",
+                pose=sapien.Pose(
+                    [0, 0, 1]
+                ),
+                width=8, height=6, fov=1.0,
+            ),
+        ]  # fmt: skip
+
+    first = inspect.getsourcelines(hook)[1]
+    sites = [private.camera_site(copy.copy(config)) for config in hook()]
+    assert [site and (site.file, site.line - first) for site in sites] == [(__file__, 3), (__file__, 4)]
+    if sys.version_info >= (3, 11):
+        assert sites[0].function == "test_a_config_knows_where_it_was_made.<locals>.hook"  # type: ignore[union-attr]
+    monkeypatch.setattr(CameraConfig, "__init__", stock)
+    assert private.camera_site(hook()[0]) is None
 
 
 def test_a_call_before_each_substep_comes_after_the_tasks_own_and_ends_with_its_context() -> None:
