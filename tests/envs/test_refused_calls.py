@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 import torch
-from mani_skill.agents.robots import Panda
 
-from tests.drive.envs import PUSH_CUBE, batched
+from tests.drive.envs import batched
 from tests.envs.written import Written
-from workbench.envs.cpu_scene import EnvClosed, ForgottenInit, drawing_alone
+from workbench.envs.cpu_scene import EnvClosed, drawing_alone
 from workbench.envs.error_notes import RefusedCall, RefusedValue
 from workbench.envs.maniskill_private import open_env
 from workbench.envs.simulation.hiding import why_not_hidden
@@ -123,56 +122,6 @@ def test_a_window_needs_a_display(env: Any, monkeypatch: pytest.MonkeyPatch) -> 
         env.render_human()
     with pytest.raises(RefusedValue):
         batched(Does, N, render_mode="human")
-
-
-class Silent(Written):
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.kept = args
-
-
-class Speaks(Silent):
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
-
-class OneEnv(Written):
-    def __init__(self, *args: Any, num_envs: int = 1, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
-
-class SilentPanda(Panda):
-    uid = "silent_panda"
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.kept = args
-
-
-class WithSilentPanda(PUSH_CUBE):
-    SUPPORTED_ROBOTS = None
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, robot_uids=SilentPanda, **kwargs)
-
-
-@pytest.mark.parametrize(
-    ("task", "at_fault", "forgets"),
-    [
-        (Silent, Silent, True),
-        (Speaks, Silent, True),
-        (OneEnv, OneEnv, False),
-        (WithSilentPanda, SilentPanda, True),
-    ],
-)
-def test_a_constructor_that_does_not_call_its_parents_is_named(
-    task: Any, at_fault: Any, forgets: bool
-) -> None:
-    with pytest.raises(RuntimeError) as caught:
-        batched(task, 3)
-    assert isinstance(caught.value, ForgottenInit) == forgets
-    assert at_fault.__name__ in str(caught.value)
-    place = caught.value.place
-    assert place is not None
-    assert place[:2] == (__file__, at_fault.__init__.__code__.co_firstlineno)
 
 
 def test_an_actor_that_cannot_be_hidden_is_refused(env: Any) -> None:
