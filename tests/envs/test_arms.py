@@ -85,15 +85,10 @@ def test_wrong_names_in_a_mode_that_is_not_used_are_no_arm(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("robot", "mode"),
     [
-        *(
-            ("panda", mode)
-            for mode in (
-                "pd_joint_delta_pos",
-                "pd_ee_delta_pos",
-                "pd_joint_vel",
-                "pd_joint_pos_vel",
-            )
-        ),
+        ("panda", "pd_joint_delta_pos"),
+        ("panda", "pd_ee_delta_pos"),
+        ("panda", "pd_joint_vel"),
+        ("panda", "pd_joint_pos_vel"),
         ("fetch", "pd_joint_pos"),
         ("fetch", "pd_ee_delta_pose"),
         ("so100", "pd_joint_delta_pos"),
@@ -231,9 +226,9 @@ def test_a_floating_gripper_follows() -> None:
     assert apart(tool(arm), target) < 0.01
 
 
-@pytest.mark.parametrize(("robot", "task"), [("panda", "PickCube-v1"), ("so100", "PickCube-v1")])
-def test_a_solution_is_within_the_limits_and_says_what_is_left(robot: str, task: str) -> None:
-    (arm,) = find_arms(opened(robot, "pd_joint_pos", task, num_envs=1).env)
+@pytest.mark.parametrize("robot", ["panda", "so100"])
+def test_a_solution_is_within_the_limits_and_says_what_is_left(robot: str) -> None:
+    (arm,) = find_arms(opened(robot, "pd_joint_pos", "PickCube-v1", num_envs=1).env)
     limits, rng = arm.limits(0), np.random.default_rng(0)
     link = objects_of(arm.link)[0].index
     for metres in (0.02, 0.1, 0.5, 3.0):

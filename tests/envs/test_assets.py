@@ -104,33 +104,16 @@ def test_the_robots_of_a_task_are_those_given_else_the_constructors_default() ->
     assert robots_of(Passes, {}) is robots_of(Needs, {}) is None
 
 
-@pytest.mark.parametrize("folder", ["", "robots"])
-def test_a_relative_path_of_a_robot_is_told_from_the_working_directory(
-    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("path", ["arm.urdf", "robots/arm.urdf", "{folder}/arm.urdf"])
+def test_a_robot_with_a_wrong_path_is_reported_with_the_whole_path_at_its_line(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A relative path begins in the working directory."""
     monkeypatch.chdir(tmp_path)
-    file = Path(folder) / "arm.urdf"
 
-    class Arm(Panda):
-        uid = "arm_with_a_relative_path"
-        urdf_path = str(file)
-
-    class Task(BaseEnv):
-        SUPPORTED_ROBOTS = None  # type: ignore[assignment]  # any
-
-        def __init__(self, *args: Any, **kwargs: Any) -> None:
-            robot: Any = Arm
-            super().__init__(*args, robot_uids=robot, **kwargs)
-
-    with pytest.raises(MissingAssets) as caught:
-        batched(Task)
-    assert str(tmp_path / file) in str(caught.value) and caught.value.place is not None
-
-
-def test_a_custom_robot_with_a_wrong_path_is_reported_at_its_line(tmp_path: Path) -> None:
     class Arm(Panda):
         uid = "arm_that_is_not_registered"
-        urdf_path = str(tmp_path / "arm.urdf")
+        urdf_path = path.format(folder=tmp_path)
 
     class Task(BaseEnv):
         SUPPORTED_ROBOTS = None  # type: ignore[assignment]  # any
@@ -139,5 +122,6 @@ def test_a_custom_robot_with_a_wrong_path_is_reported_at_its_line(tmp_path: Path
             robot: Any = Arm
             super().__init__(*args, robot_uids=robot, **kwargs)
 
-    with pytest.raises(MissingAssets, match=r"arm\.urdf.*test_assets\.py:\d+"):
+    with pytest.raises(MissingAssets, match=r"arm\.urdf.*test_assets\.py:\d+") as caught:
         batched(Task)
+    assert str(tmp_path / Arm.urdf_path) in str(caught.value) and caught.value.place is not None

@@ -204,12 +204,6 @@ def test_control(control_mode: str) -> None:
     follow_under_control(control_mode)
 
 
-@pytest.mark.parametrize("control_mode", ["pd_ee_delta_pos", "pd_ee_delta_pose"])
-def test_control_in_the_hands_frame(control_mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Panda, "_controller_configs", property(body_frame_configs))
-    follow_under_control(control_mode)
-
-
 def interpolating_configs(panda: Any) -> dict[str, Any]:
     """Modes whose controllers set a target before each substep."""
     configs = PANDA_CONFIGS(panda)
@@ -219,9 +213,19 @@ def interpolating_configs(panda: Any) -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
-@pytest.mark.parametrize("control_mode", ["pd_ee_delta_pos", "pd_joint_delta_pos"])
-def test_control_with_targets_between_substeps(control_mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Panda, "_controller_configs", property(interpolating_configs))
+@pytest.mark.parametrize(
+    ("configs", "control_mode"),
+    [
+        (body_frame_configs, "pd_ee_delta_pos"),
+        (body_frame_configs, "pd_ee_delta_pose"),
+        (interpolating_configs, "pd_ee_delta_pos"),
+        (interpolating_configs, "pd_joint_delta_pos"),
+    ],
+)
+def test_control_in_the_hands_frame_and_with_targets_between_substeps(
+    configs: Any, control_mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Panda, "_controller_configs", property(configs))
     follow_under_control(control_mode)
 
 

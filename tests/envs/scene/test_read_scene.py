@@ -94,10 +94,8 @@ def test_silhouettes_match_the_renderers() -> None:
     env.close()
 
 
-def redrawn(
-    geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shader: str, texture: str
-) -> NDArray:
-    """Render `texture` of the env's human camera in a new scene built from env 0 of `geometry`."""
+def redrawn(geometry: SceneGeometry, poses: NDArray[np.float32], env: Any) -> NDArray:
+    """Render the albedo of the env's human camera in a new scene built from env 0 of `geometry`."""
     scene = sapien.Scene(
         [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device(RENDER_DEVICE))]
     )
@@ -123,7 +121,7 @@ def redrawn(
             entity.pose = sapien.Pose(at[:3], at[3:])
             scene.add_entity(entity)
     original = env._human_render_cameras["render_camera"].camera._render_cameras[0]
-    set_shader_pack(PREBUILT_SHADER_CONFIGS[shader])
+    set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])
     copy = sapien.render.RenderCameraComponent(original.width, original.height)
     copy.set_fovy(original.fovy, compute_x=True)
     copy.near, copy.far = original.near, original.far
@@ -133,7 +131,7 @@ def redrawn(
     scene.add_entity(holder)
     scene.update_render()
     copy.take_picture()
-    return np.array(copy.get_picture(texture)[..., :3])
+    return np.array(copy.get_picture("Albedo")[..., :3])
 
 
 def test_colours_and_textures_match_the_renderers() -> None:
@@ -146,7 +144,7 @@ def test_colours_and_textures_match_the_renderers() -> None:
     env.scene.sub_scenes[0].update_render()
     component.take_picture()
     wanted = component.get_picture("Albedo")[..., :3]
-    again = redrawn(geometry, read_poses(env), env, "default", "Albedo")
+    again = redrawn(geometry, read_poses(env), env)
     difference = np.abs(again - wanted).max(axis=-1)
     assert wanted.std() > 0.1
     assert (difference > 0.02).mean() < 1e-3
@@ -268,13 +266,17 @@ PIXELS = np.zeros((4, 4, 4), np.uint8)
 PIXELS[..., 0], PIXELS[..., 3] = 51, 102
 
 
-@pytest.fixture
-def odd_shapes(tmp_path: Path) -> Any:
+def wedge_file(folder: Path) -> str:
     wedge = trimesh.Trimesh(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
     )
-    wedge.export(tmp_path / "wedge.obj")
-    OddShapesEnv.mesh_file = str(tmp_path / "wedge.obj")
+    wedge.export(folder / "wedge.obj")
+    return str(folder / "wedge.obj")
+
+
+@pytest.fixture
+def odd_shapes(tmp_path: Path) -> Any:
+    OddShapesEnv.mesh_file = wedge_file(tmp_path)
     env: Any = OddShapesEnv(render_backend=RENDER_BACKEND, reward_mode="none")
     env.reset(seed=0)
     yield env
@@ -360,11 +362,7 @@ class CollisionsEnv(Bare):
 
 
 def test_collision_shapes_have_their_size_place_and_the_colour_of_their_kind(tmp_path: Path) -> None:
-    wedge = trimesh.Trimesh(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
-    )
-    wedge.export(tmp_path / "wedge.obj")
-    CollisionsEnv.mesh_file = str(tmp_path / "wedge.obj")
+    CollisionsEnv.mesh_file = wedge_file(tmp_path)
     env = batch_of(CollisionsEnv, 2)
     visual = {v.name: v for v in read_geometry(env).visuals}
     bounds = {
