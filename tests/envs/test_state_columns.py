@@ -13,7 +13,6 @@ from mani_skill.utils import common
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.envs.hot_swap import put_class
 from workbench.envs.inspect_env import inspect_env
-from workbench.envs.recorded_run import states_of
 from workbench.envs.state_columns import StateReading, read_state_columns
 from workbench.envs.task_env import TaskEnv
 
@@ -168,12 +167,3 @@ def test_tensors_of_a_device_keep_their_values_and_order() -> None:
         column = columns[name]
         assert column.shape == tuple(value.shape) and column.dtype == np.asarray(value).dtype
         np.testing.assert_array_equal(column, np.asarray(value))
-
-
-def test_actors_that_an_env_lacks_are_left_out_of_its_states() -> None:
-    columns = {
-        "state/actors/mug": np.array([[np.nan] * 13, [0.5] * 13], np.float32),
-        "obs/agent/qpos": np.full((2, 2), np.nan),
-    }
-    assert states_of(columns, 0) == {}
-    assert list(states_of(columns, 1)) == ["actors/mug"]
