@@ -124,4 +124,4 @@ def test_a_robot_with_a_wrong_path_is_reported_with_the_whole_path_at_its_line(
 
     with pytest.raises(MissingAssets, match=r"arm\.urdf.*test_assets\.py:\d+") as caught:
         batched(Task)
-    assert str(tmp_path / Arm.urdf_path) in str(caught.value) and caught.value.place is not None
+    assert str(tmp_path / str(Arm.urdf_path)) in str(caught.value) and caught.value.place is not None
