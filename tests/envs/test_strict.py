@@ -358,13 +358,17 @@ def move_a_wall(env: Any, options: dict) -> None:
     builder.build_static("wall").set_pose(sapien.Pose())
 
 
+def target_all_joints(env: Any, options: dict) -> None:
+    env.agent.robot.set_joint_drive_targets(torch.zeros((N, 9)), env.agent.robot.active_joints)
+
+
 @pytest.mark.parametrize(
     ("name", "hook", "rule"),
     [
         ("_load_scene", lambda env, options: env.cube.pose and None, "state-while-built"),
         ("_load_scene", lambda env, options: env.agent.robot.set_qpos(torch.zeros(9)), "state-while-built"),
         ("_load_scene", move_a_wall, "state-while-built"),
-        ("_load_scene", lambda env, options: set_target_of_a_joint(env), "state-while-built"),
+        ("_load_scene", target_all_joints, "state-while-built"),
         (
             "_load_scene",
             lambda env, options: env.agent.robot.active_joints[0].set_drive_velocity_target(0.3),

@@ -183,26 +183,6 @@ def test_a_velocity_of_a_kinematic_actor_is_not_passed_to_physx(pick_cubes: Base
     assert all((body.linear_velocity == 0.5).all() for body in pick_cubes.cube._bodies)
 
 
-def test_every_env_has_its_own_ground() -> None:
-    class DropsACube(REGISTERED_ENVS["PickCube-v1"].cls):
-        """The cube falls past the table onto the floor, which the table scene builds 0.92 m below."""
-
-        def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-            super()._initialize_episode(env_idx, options)
-            pose = self.cube.pose.raw_pose.clone()
-            pose[:, :3] = torch.tensor([-2.0, 0.0, -0.7])
-            self.cube.set_pose(Pose.create(pose[env_idx]))
-
-    env = batched_class(DropsACube)(num_envs=3, **STATE_ONLY)
-    env.reset(seed=[0, 1, 2])
-    for _ in range(20):
-        env.step(np.zeros((3, 8), np.float32))
-    heights = env.cube.pose.p[:, 2]
-    assert torch.allclose(heights, heights[:1]), heights
-    assert float(heights.min()) > -0.95, "fell through the floor"
-    env.close()
-
-
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 def test_values_written_to_tensors_and_applied_reach_physx() -> None:
     env = batch_of(ThrowsAFreeChain, 3)
