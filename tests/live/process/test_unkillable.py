@@ -287,8 +287,9 @@ def test_a_recording_loses_only_the_step_in_progress(session: Session, file: Pat
     before, worker = session.view(), session.worker_pid
     provoke(file, "reward", "kill")
     session.do(Step())
+    wait_until(session, lambda v: v.problem is not None and v.problem.stage == "worker", "the death")
+    calm(file)  # at once: the reward of the restored moment would kill the next worker too
     view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written > written, "the file")
-    calm(file)
     assert not view.of(RecordingStatus).active and view.of(RecordingStatus).problem is None
     assert verify_rrd(view.of(RecordingStatus).last_file) is None
     assert "5" in str(read_properties(Path(view.of(RecordingStatus).last_file)))
