@@ -11,7 +11,6 @@ from tests.drive.session import FakeWorker, fake_worker_session
 from tests.drive.waiting import until
 from workbench.live.commands import PauseRun, ResetAll, Step
 from workbench.live.messages import Play, Request, Reset, Settings, SingleStep
-from workbench.live.timeline_commands import Seek
 from workbench.machine.processes.watched_thread import listen, stop_listening
 
 
@@ -54,43 +53,6 @@ def test_an_effect_that_fails_once_is_reported_and_affects_nothing_else(tmp_path
             assert fake.view.problem is None
     finally:
         stop_listening(said.append)
-
-
-def test_concurrent_presses_on_two_pages_each_count_once(tmp_path: Path) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.play(2)
-        fake.asked(object)
-
-        def press(page: str) -> None:
-            for _ in range(100):
-                fake.session.do(Step(), page)
-
-        pages = [threading.Thread(target=press, args=(page,)) for page in ("one", "other")]
-        for page in pages:
-            page.start()
-        for page in pages:
-            page.join()
-        assert len(fake.asked(SingleStep)) == 200
-
-
-def test_a_slider_dragged_on_one_page_does_not_swallow_keys_of_another(tmp_path: Path) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.play(5)
-        fake.asked(object)
-        ends = threading.Event()
-
-        def drag() -> None:
-            while not ends.is_set():
-                for step in range(5):
-                    fake.session.do(Seek(step=step), "one")
-
-        dragging = threading.Thread(target=drag, daemon=True)
-        dragging.start()
-        for _ in range(50):
-            fake.session.do(Step(), "other")
-        ends.set()
-        dragging.join()
-        assert len(fake.asked(SingleStep)) == 50
 
 
 def test_a_worker_that_floods_steps_does_not_delay_a_press(tmp_path: Path) -> None:
