@@ -276,5 +276,6 @@ def test_a_reading_is_repeated_after_a_failure_and_for_all_that_it_depends_on() 
         assert again(answer, change) == 1, change
     assert again(TaskFailed(PROBLEM, kept=True, at_run=True), stepped(1, ())) == 1, "there is no answer"
     assert again(stepped(1, ())) == 0, "the last answer is awaited"
+    assert again(loaded("rebuilt", "two")) == 1, "another scene, although it is"
     assert again(answer, ReadingChosen(()), stepped(1, ())) == 0
     assert again(answer, PagesCounted(0), stepped(1, ())) == 0

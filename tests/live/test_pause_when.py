@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -16,14 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.scenes import step_of, table_scene
-from tests.drive.session import fake_worker_session
+from tests.drive.session import FakeWorkerSession, moment
 from workbench.live.commands import ChoosePauseEntry, ChoosePauseTest, PlayRun, SetPauseLevel, Step
 from workbench.live.messages import Play
 from workbench.live.pause_when import PauseWhen, Test
 
 POSES = table_scene(3)[1]
-
-
 MET: dict[Test, Callable[[float, float], bool]] = {
     "becomes true": lambda value, level: value != 0,
     "becomes false": lambda value, level: value == 0,
@@ -54,53 +51,63 @@ def test_a_condition_holds_where_it_becomes_met(test: Test, old: float, new: flo
     assert not PauseWhen("", test).holds(before, now, 1) and not PauseWhen("gone", test).holds(before, now, 1)
 
 
-@pytest.mark.parametrize("late", [0, 2])
-def test_the_run_pauses_and_shows_the_step_at_which_the_selected_env_succeeds(
-    tmp_path: Path, late: int
-) -> None:
-    """The worker makes `late` further steps before the pause arrives."""
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        session = fake.session
-        session.change(selected_env=1)
-        session.do(ChoosePauseEntry(entry="success"))
-        session.do(PlayRun())
-        fake.step(2)
-        fake.step(1, success=(0,))
-        assert session.view().playing, "another env succeeded"
-        fake.step(1, success=(0, 1))
-        met = session.view().timeline.last
-        fake.step(late, success=(0, 1)) if late else None
-        view = session.view()
-        assert not view.playing and [request.playing for request in fake.asked(Play)] == [True, False]
-        assert view.step_serial == met and view.paused_at == met
-        session.do(PlayRun())
-        fake.step(3, success=(0, 1))
-        assert session.view().playing, "the condition was met before"
+def test_the_run_pauses_at_the_step_at_which_the_selected_env_succeeds(fake: FakeWorkerSession) -> None:
+    fake.load()
+    session = fake.session
+    session.change(selected_env=1)
+    session.do(ChoosePauseEntry(entry="success"))
+    session.do(PlayRun())
+    fake.step(2)
+    fake.step(success=(0, 2))
+    assert fake.view.playing, "other envs succeeded"
+    fake.step(success=(0, 1))
+    met = fake.view.timeline.last
+    fake.step(2, success=(0, 1))  # the worker makes further steps before the pause arrives
+    assert not fake.view.playing and [request.playing for request in fake.asked(Play)] == [True, False]
+    assert fake.view.step_serial == fake.view.paused_at == met
+    session.do(PlayRun())
+    assert fake.view.paused_at is None
+    fake.step(3, success=(0, 1))
+    assert fake.view.playing, "the condition was met before"
 
 
-def test_single_steps_do_not_pause_and_leave_the_moment(tmp_path: Path) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        fake.session.do(ChoosePauseEntry(entry="success"))
-        fake.session.do(Step())
-        fake.step(1, success=(0,))
-        assert fake.session.view().paused_at is None
-        assert fake.session.view().timeline.shown is None
+def test_a_new_episode_in_which_the_condition_is_met_at_once_pauses(fake: FakeWorkerSession) -> None:
+    """The end of the last episode does not count as before."""
+    fake.play(1)
+    fake.session.change(selected_env=1)
+    fake.session.do(ChoosePauseEntry(entry="success"))
+    fake.session.do(PlayRun())
+    fake.step(success=(1,))
+    fake.session.do(PlayRun())
+    elapsed = np.array([9, 1, 9], np.int32)
+    fake.tell(moment(elapsed, success=(1,), number=50))
+    assert not fake.view.playing
+    fake.session.do(PlayRun())
+    fake.tell(moment(np.array([1, 2, 1], np.int32), success=(1,), number=51))
+    assert fake.view.playing, "another env's episode does not matter"
 
 
-def test_a_threshold_is_chosen_with_its_level(tmp_path: Path) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        for command in (
-            ChoosePauseEntry(entry="reward"),
-            ChoosePauseTest(test="rises above"),
-            SetPauseLevel(level=0.5),
-            PlayRun(),
-        ):
-            fake.session.do(command)
-        fake.step(1, reward=(0.4, 0.9, 0.9))
-        assert fake.session.view().playing
-        fake.step(1, reward=(0.6, 0.0, 0.0))
-        view = fake.session.view()
-        assert not view.playing and view.pause_when.text == "reward rises above 0.5"
+def test_single_steps_do_not_pause_and_leave_the_moment(fake: FakeWorkerSession) -> None:
+    fake.load()
+    fake.session.do(ChoosePauseEntry(entry="success"))
+    fake.session.do(PlayRun())
+    fake.step(success=(0,))
+    fake.session.do(Step())
+    fake.step()
+    fake.step(success=(0,))
+    assert fake.view.paused_at is None and fake.view.timeline.shown is None
+
+
+def test_a_threshold_is_chosen_with_its_level(fake: FakeWorkerSession) -> None:
+    fake.load()
+    for command in (
+        ChoosePauseEntry(entry="reward"),
+        ChoosePauseTest(test="rises above"),
+        SetPauseLevel(level=0.5),
+        PlayRun(),
+    ):
+        fake.session.do(command)
+    fake.step(reward=(0.4, 0.9, 0.9))
+    assert fake.view.playing
+    fake.step(reward=(0.6, 0.0, 0.0))
+    assert not fake.view.playing and fake.view.pause_when.text == "reward rises above 0.5"
