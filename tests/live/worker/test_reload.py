@@ -157,9 +157,6 @@ def test_a_requested_level_is_taken_whatever_has_changed(desk: Desk, level: Load
     assert desk.save(desk.file.read_text()).level == "same"
 
 
-# --- failures --------------------------------------------------------------------------------------
-
-
 # --- levels: cameras, rebuilt, requested ------------------------------------------------------------------------
 
 
