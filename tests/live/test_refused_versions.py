@@ -158,17 +158,6 @@ def test_after_a_failure_at_run_time_a_reset_and_steps_equal_those_of_a_clean_pr
         assert view.step.elapsed_steps.tolist() == [3, 3]
 
 
-@pytest.mark.parametrize("text", ["# to be written\n", "def broken(:\n"])
-def test_a_file_of_which_no_code_ran_costs_no_process(
-    mended: Session, task_file: Path, good: str, text: str
-) -> None:
-    worker = mended.worker_pid
-    task_file.write_text(text)
-    wait_until(mended, lambda v: v.problem is not None, "the refusal")
-    save(mended, task_file, good)
-    assert mended.worker_pid == worker, mended.view().reload
-
-
 @pytest.mark.slow
 def test_recording_and_playing_go_on_after_a_refused_version(
     task_file: Path, good: str, tmp_path: Path

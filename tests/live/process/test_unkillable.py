@@ -94,23 +94,22 @@ def back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3))
 # --- hangs ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", ["evaluate", "reward"])
 def test_an_infinite_loop_in_a_step_is_reported_and_can_be_interrupted_with_its_traceback(
-    session: Session, file: Path, place: str
+    session: Session, file: Path
 ) -> None:
     before, worker = session.view(), session.worker_pid
-    provoke(file, place, "loop")
+    provoke(file, "reward", "loop")
     session.do(Step())
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
-    assert place in busy.doing and busy.seconds >= supervisor.BUSY_SECONDS and not busy.ignores_interrupt
+    assert "reward" in busy.doing and busy.seconds >= supervisor.BUSY_SECONDS and not busy.ignores_interrupt
     assert busy.file == str(file) and busy.code in ("while True:", "pass")
     session.do(Step())
     session.do(Step())
     session.do(PlayRun())
     session.do(Interrupt())
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
-    assert view.problem.stage == place and view.problem.interrupted
-    assert view.problem.file == str(file) and f'hazard("{place}")' in view.problem.traceback
+    assert view.problem.stage == "reward" and view.problem.interrupted
+    assert view.problem.file == str(file) and 'hazard("reward")' in view.problem.traceback
     calm(file)
     # The interrupted step leaves no trace: the next step is the same as without it.
     session.do(Step())
@@ -164,11 +163,11 @@ def test_a_loop_in_a_load_can_be_interrupted_and_the_last_good_version_stays(
     wait_until(session, lambda v: v.problem is None and not v.stale, "the new version")
 
 
-@pytest.mark.slow
-def test_a_save_behind_a_hang_is_loaded_in_a_new_worker(session: Session, file: Path) -> None:
+@pytest.mark.parametrize("during", ["load", pytest.param("step", marks=pytest.mark.slow)])
+def test_a_save_behind_a_hang_is_loaded_in_a_new_worker(session: Session, file: Path, during: str) -> None:
     before, worker = session.view(), session.worker_pid
     provoke(file, "evaluate", "loop")
-    session.do(Step())
+    edit(file) if during == "load" else session.do(Step())
     wait_until(session, lambda v: v.busy is not None, "busy")
     calm(file)
     edit(file)
@@ -369,19 +368,19 @@ def test_an_error_of_a_saved_version_is_shown_with_that_versions_code(
     assert session.worker_pid != worker, "a refused version costs its process"
 
 
-@pytest.mark.parametrize("what", ["device", pytest.param("large", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("what", ["device", "loop", "missing", pytest.param("large", marks=pytest.mark.slow)])
 def test_a_task_path_that_is_no_longer_a_file_is_reported_and_loaded_once_fixed(
     session: Session, file: Path, what: str
 ) -> None:
-    good, before = file.read_text(), session.view()
+    good, before, worker = file.read_text(), session.view(), session.worker_pid
     resident = psutil.Process().memory_info().rss
     other = file.with_name("other")
-    if what == "device":
-        other.symlink_to("/dev/zero")
-    else:
+    if what == "large":
         with other.open("wb") as written:
             written.truncate(2**40)
-    other.replace(file)
+    elif what != "missing":
+        other.symlink_to("/dev/zero" if what == "device" else file)
+    file.unlink() if what == "missing" else other.replace(file)
     try:
         view = wait_until(session, lambda v: v.problem is not None, "the problem")
         named = "/dev/zero" if what == "device" else str(file)
@@ -389,6 +388,7 @@ def test_a_task_path_that_is_no_longer_a_file_is_reported_and_loaded_once_fixed(
         session.do(Step())
         wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
         assert psutil.Process().memory_info().rss - resident < 200 * 2**20
+        assert session.worker_pid == worker
     finally:
         other.write_text(good)
         other.replace(file)
