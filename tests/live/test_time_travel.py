@@ -48,19 +48,6 @@ def is_close(poses: np.ndarray, others: np.ndarray) -> bool:
     return np.allclose(poses, others, rtol=0, atol=1e-6, equal_nan=True)
 
 
-def test_scrubbing_shows_past_moments(session: Session) -> None:
-    start = fresh(session)
-    step(session, 5)
-    for serial in (*range(start, start + 6), *range(start + 5, start - 1, -1)):
-        session.happen(MomentShown(serial))
-        view = session.view()
-        assert np.array_equal(view.step.poses, poses(session, serial), equal_nan=True)
-        assert view.step.elapsed_steps[0] == serial - start
-        assert view.timeline.shown == (serial if serial < start + 5 else None)
-    session.happen(MomentShown(None))
-    assert session.view().timeline.shown is None and session.view().timeline.last == start + 5
-
-
 def test_a_branch_repeats_the_past_to_the_last_bit(session: Session) -> None:
     start = fresh(session)
     step(session, 8)
