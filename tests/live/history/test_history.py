@@ -172,17 +172,6 @@ def test_a_rescored_moment_keeps_its_recorded_reward(played: FakeWorkerSession) 
     assert 0 < played.view.timeline.used - used < 2500, "its bytes are counted once"
 
 
-def test_rewards_of_an_episode_follow_where_it_went_back_to(fake: FakeWorkerSession) -> None:
-    fake.play(4)
-    fake.back((0,), (1,), 2)
-    fake.step()
-    fake.reset((2,))
-    assert rewards(fake) == [[1, 2, 3], [1, 2, 3, 4, 5], []]
-    fake.step()
-    fake.session.happen(MomentShown(6))
-    assert rewards(fake) == [[1, 2, 3], [1, 2, 3, 4, 5], [1, 2, 3, 4, 5]]
-
-
 def test_each_env_that_went_back_has_the_past_of_its_own_source(fake: FakeWorkerSession) -> None:
     fake.play(0)
     for number in (10.0, 20.0, 30.0):

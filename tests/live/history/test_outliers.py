@@ -14,8 +14,6 @@ from tests.drive.session import live_session, wait_until
 from workbench.app.session import Session
 from workbench.envs.outliers import OUTLIER_RULES, OutlierKind
 from workbench.live.commands import Step
-from workbench.live.events import EnvsReset
-from workbench.live.history.env_table import Outcome
 
 BROKEN = '''
 import sapien
@@ -117,13 +115,3 @@ def test_each_outlier_is_a_finding_of_its_rule_at_the_hook(one_of_each: Session)
     assert found["entries-finite"].code == "def evaluate(self):" and found["entries-finite"].degree == "warn"
     assert found["bodies-stay"].function == "_initialize_episode" and found["bodies-stay"].count > 20
     assert found["reward-finite"].message == "the reward is NaN, in env 6 at step 1 of its episode"
-
-
-def test_after_a_reset_the_last_episode_has_the_outliers(one_of_each: Session) -> None:
-    before = one_of_each.env_rows()
-    one_of_each.happen(EnvsReset((2,)))
-    wait_until(one_of_each, lambda v: v.step.elapsed_steps[2] == 0, "the reset")
-    rows = one_of_each.env_rows()
-    assert 2 not in rows.outliers and rows.last.outliers[2] == before.outliers[2]
-    assert rows.last.outcome[2] == Outcome.RUNNING and rows.last.steps[2] == before.steps[2]
-    assert rows.outliers.keys() == before.outliers.keys() - {2}
