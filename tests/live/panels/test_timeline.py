@@ -26,8 +26,6 @@ from workbench.live.timeline_commands import (
     ContinueFromHere,
     GoToFirst,
     GoToLast,
-    NextEvent,
-    PreviousEvent,
     Seek,
     SeekBack,
     StepBack,
@@ -89,17 +87,6 @@ def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]
     return EnvMoment(session, page, panels, clock)
 
 
-def test_the_timeline_appears_at_the_first_moment_and_offers_only_possible_actions(lived: EnvMoment) -> None:
-    assert not lived.panels.part("Timeline").seen, "the page is not drawn yet"
-    lived.draw()
-    assert lived.panels.part("Timeline").seen
-    lived.step(4)
-    assert lived.ends() == (-4, 0, 0)
-    assert not lived.panels.presses(ContinueFromHere()), "the view is live"
-    assert not lived.panels.presses(UndoReset()), "there is nothing before the first reset"
-    assert "live" in lived.strip()
-
-
 def test_the_view_the_numbers_and_the_status_line_show_the_past_moment(lived: EnvMoment) -> None:
     lived.step(2)
     there = lived.hand()
@@ -115,49 +102,6 @@ def test_the_view_the_numbers_and_the_status_line_show_the_past_moment(lived: En
     lived.panels.do(GoToLast())
     lived.draw()
     assert "live" in lived.strip() and not lived.panels.presses(ContinueFromHere())
-
-
-def test_continuing_takes_the_named_envs_back(lived: EnvMoment) -> None:
-    lived.step(4)
-    lived.panels.ask(StepBack())
-    lived.panels.ask(StepBack())
-    lived.draw()
-    lived.panels.ask(ContinueFromHere())
-    view = wait_until(lived.session, lambda view: view.timeline.last == 5, "the jump")
-    assert view.step is not None and view.step.elapsed_steps.tolist() == [2, 4, 4]
-    lived.draw()
-    lived.panels.ask(StepBack())
-    lived.draw()
-    lived.panels.ask(ContinueFromHere(scope="all"))
-    view = wait_until(lived.session, lambda view: view.timeline.last == 6, "the other jump")
-    assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
-
-
-def test_zoom_to_episode_starts_the_slider_at_the_episode(lived: EnvMoment) -> None:
-    lived.step(4)
-    last = lived.past.last
-    lived.panels.do(ResetAll())
-    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
-    lived.step(3)
-    lived.panels.ask(ZoomTimeline(episode_only=True))
-    lived.draw()
-    assert lived.ends()[0] == -3
-    lived.panels.do(GoToFirst())
-    assert lived.past.shown == lived.past.last - 3, "of the episode"
-    assert lived.past.steps_ago == 3
-    lived.panels.do(GoToLast())
-    lived.draw()
-    assert "undo reset of all" in lived.panels.html("wb-tools")
-    lived.panels.ask(ZoomTimeline(episode_only=False))
-    lived.draw()
-    assert lived.ends()[0] == -7
-    lived.panels.do(GoToFirst())
-    assert lived.past.shown == lived.past.first
-    lived.panels.do(GoToLast())
-    lived.draw()
-    lived.panels.ask(UndoReset())
-    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the end of the jump back")
-    assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
 def test_the_slider_ends_follow_a_moment_beyond_them_at_once_and_others_rarely(lived: EnvMoment) -> None:
@@ -198,25 +142,6 @@ def test_a_single_moment_has_a_valid_slider_range(lived: EnvMoment) -> None:
     lived.step(1)
     assert not lived.panels.field(SLIDER).off and lived.ends() == (-1, 0, 0)
     assert "history: 1 step," in lived.strip()
-
-
-def test_home_is_the_left_end_of_the_slider(lived: EnvMoment) -> None:
-    lived.step(3)
-    lived.panels.do(GoToFirst())
-    assert lived.past.shown == 0
-    last = lived.past.last
-    lived.panels.do(ResetAll())
-    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
-    lived.step(2)
-    lived.panels.ask(ZoomTimeline(episode_only=True))
-    lived.panels.do(GoToLast())
-    lived.draw()
-    lived.panels.do(GoToFirst())
-    assert lived.past.shown == 4
-    lived.panels.do(PreviousEvent())
-    assert lived.past.shown == 0
-    lived.panels.do(NextEvent())
-    assert lived.past.shown == 4
 
 
 # --- on a view without a session -----------------------------------------------------------------------
