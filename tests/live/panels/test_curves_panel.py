@@ -79,16 +79,6 @@ def test_the_episode_is_drawn_over_the_last_ten(live: Live) -> None:
     assert len(chart.of(BESIDE_COLOUR)) == 10 * 5
 
 
-def test_it_can_be_drawn_over_the_other_envs(live: Live) -> None:
-    episodes = Episodes(live, 5, 4, ended=20)
-    live.show(episodes.view(env=3))
-    live.part("Reward").set("Compare with", "the other envs")
-    live.show(episodes.view(env=3))
-    beside = live.part("Reward").charts()[0].of(BESIDE_COLOUR)
-    others = [point for env in (0, 1, 2) for point in reward(5, 4, env)]
-    np.testing.assert_allclose(beside, others, atol=0.05)
-
-
 @pytest.mark.thorough
 def test_a_long_episode_is_drawn_as_few_points(live: Live) -> None:
     live.show(Episodes(live, 3000, 2).view())

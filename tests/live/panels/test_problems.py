@@ -310,17 +310,6 @@ def test_the_status_line_shows_the_planning_time(live: Live) -> None:
     assert "building 1 env" in planning(state="starting", activity="building 1 env")
 
 
-def test_a_new_version_is_announced_for_some_seconds(live: Live) -> None:
-    live.show(running(4, task_serial=1))
-    view = running(
-        4, task_serial=2, reload=ReloadReport("patched", "only reward changed"), load_milliseconds=43.2
-    )
-    live.show(view, seconds=1.0)
-    assert "patched in 43 ms: only reward changed" in live.html("wb-status")
-    live.again()
-    assert "patched" not in live.html("wb-status")
-
-
 # --- the version -----------------------------------------------------------------------------------
 
 
