@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,16 +9,15 @@ import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import page_at
+from tests.drive.served import redrawn, served
 from tests.drive.waiting import until
 from tests.episodes.library_files import describe
-from workbench.commands import COMMANDS
 from workbench.library.folder import Library
 from workbench.library.panel import LibraryPanel
 from workbench.page.command import Command
 from workbench.page.commands import CloseDialog
-from workbench.page.door.gated_server import ServerOptions, open_server
 from workbench.page.widgets.keys_and_palette import register
-from workbench.page.widgets.visitors import PATH, Visitor, Visitors
+from workbench.page.widgets.visitors import Visitor
 
 pytestmark = pytest.mark.browser
 COUNT = 60
@@ -51,44 +49,30 @@ def opened(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterat
     for k in range(COUNT):
         when = f"2026-11-21T10:{k:02}:00"
         describe(folder, f"r{k:02}", id=f"id{k:02}", seed=k, written_at=when, tags=["even"] * (k % 2 == 0))
-    gated_server = open_server(ServerOptions(port=0))
-    server = gated_server.server
-    visitors = Visitors(server, COMMANDS)
     library, opened = Library(folder), []
     library.watch()
-    window = server.gui.add_panel()
-    with window.add_tab("Library"):
-        panel = LibraryPanel(server, library, opened.append)
-    gated_server.add_channel(PATH, visitors.serve)
+    with served() as (gated_server, visitors):
+        server = gated_server.server
+        window = server.gui.add_panel()
+        with window.add_tab("Library"):
+            panel = LibraryPanel(server, library, opened.append)
 
-    def do(command: Command, visitor: Visitor) -> None:
-        if isinstance(command, CloseDialog):
-            panel.close()
-        else:
-            panel.do(command, visitor)
+        def do(command: Command, visitor: Visitor) -> None:
+            if isinstance(command, CloseDialog):
+                panel.close()
+            else:
+                panel.do(command, visitor)
 
-    visitors.do = do
-    register(server, visitors, frozenset({*panel.does, CloseDialog}), "page")
-    window.dock_left()
-    window.set_width(520)
-    stopping = threading.Event()
-
-    def draw() -> None:
-        while not stopping.wait(1 / 30):
-            panel.draw()
-
-    drawing = threading.Thread(target=draw, daemon=True)
-    drawing.start()
-    with page_at(browser, "about:blank") as (page, errors):
-        page.set_default_timeout(15_000)
-        page.goto(gated_server.url)
-        page.wait_for_selector(".wb-library tbody")
-        yield Shown(page, panel, library, opened)
-        assert not errors
-    stopping.set()
-    drawing.join()
+        visitors.do = do
+        register(server, visitors, frozenset({*panel.does, CloseDialog}), "page")
+        window.dock_left()
+        window.set_width(520)
+        with redrawn(panel.draw, 1 / 30), page_at(browser, gated_server.url) as (page, errors):
+            page.set_default_timeout(15_000)
+            page.wait_for_selector(".wb-library tbody")
+            yield Shown(page, panel, library, opened)
+            assert not errors
     library.close()
-    gated_server.close()
 
 
 @pytest.fixture
