@@ -12,9 +12,6 @@ from playwright.sync_api import Browser, expect
 from tests.drive.far_line import line_to
 from tests.drive.page import TASK, new_page, open_tab, open_workbench
 from tests.drive.waiting import until
-from workbench.commands import COMMANDS
-from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 NAME = "document.querySelector('[data-page]')?.dataset.page"
@@ -33,28 +30,7 @@ def test_a_lost_server_is_reported_with_its_address(browser: Browser, tmp_path: 
         page.close()
 
 
-def test_the_notice_disappears_when_the_server_is_reachable_again(browser: Browser) -> None:
-    gated_server = open_server(ServerOptions(port=0))
-    gated_server.add_channel(PATH, Visitors(gated_server.server, COMMANDS).serve)
-    try:
-        with line_to(gated_server.url) as line:
-            page, _ = new_page(browser, drawn=False)
-            page.goto(line.address(gated_server.url))
-            page.wait_for_selector("[data-page]", state="attached")
-        gone = page.get_by_role("alert").filter(has_text=str(line.port))
-        expect(gone).to_be_in_viewport()
-        page.wait_for_timeout(3000)  # time for retries
-        expect(gone).to_have_count(1)
-        with line_to(gated_server.url, port=line.port):
-            expect(gone).to_have_count(0)
-            page.wait_for_timeout(2000)  # time in which the notice would reappear
-            expect(gone).to_have_count(0)
-            page.close()
-    finally:
-        gated_server.close()
-
-
-def test_a_reconnected_page_keeps_its_tab_and_env_and_its_commands_work(
+def test_a_reconnected_page_shows_no_notice_and_its_tab_and_env_and_its_commands_work(
     browser: Browser, tmp_path: Path
 ) -> None:
     task = shutil.copy(TASK, tmp_path)
@@ -74,15 +50,19 @@ def test_a_reconnected_page_keeps_its_tab_and_env_and_its_commands_work(
             page.keyboard.press("n")
             open_tab(page, "Inspect")
             expect_unchanged()
-        expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_be_in_viewport()
+        gone = page.get_by_role("alert").filter(has_text=str(line.port))
+        expect(gone).to_be_in_viewport()
+        page.wait_for_timeout(3000)  # time for retries
+        expect(gone).to_have_count(1)
         name = page.evaluate(NAME)
         with line_to(opened.url, port=line.port):
             until(lambda: page.evaluate(NAME) not in (None, name), "the page's new name")
-            expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_have_count(0)
+            expect(gone).to_have_count(0)
             expect_unchanged()
             page.keyboard.press("Space")
             expect(page.locator(".wb-status").get_by_text("running", exact=True).first).to_be_visible()
             page.keyboard.press("Space")
             expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
             expect_unchanged()
+            expect(gone).to_have_count(0)
             page.close()
