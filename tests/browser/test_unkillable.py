@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
@@ -13,7 +12,6 @@ from tests.drive.desk import Desk
 from tests.drive.page import page_on
 from tests.drive.waiting import until
 from tests.live.hazards import calm, provoke, write_task
-from workbench.machine.processes.family import family
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
@@ -63,21 +61,3 @@ def test_restart_ends_uninterruptible_work(desk: Desk) -> None:
     expect(desk.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     desk.timeline_says(where)
     assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
-    # The new worker and the next spare are forks: neither did the imports itself.
-    every = [Path(f"/proc/{pid}/cmdline").read_text() for pid in family(desk.opened.process.pid)]
-    assert any("worker.fork_server" in one for one in every)
-    assert not any("session.worker.start" in one for one in every)
-
-
-def test_the_log_shows_printed_lines_and_can_be_cleared(desk: Desk) -> None:
-    desk.tab("Run")
-    provoke(desk.file, "reset", "flood")
-    desk.button("Reset all").click()
-    desk.tab("Log")
-    expect(desk.page.get_by_text(re.compile("more were dropped: they came too fast"))).to_be_visible()
-    expect(desk.page.get_by_text(re.compile("all work and no play")).first).to_be_visible()
-    expect(desk.page.get_by_text(re.compile(r"Memory: .* GB allowed"))).to_be_visible()
-    until(lambda: not (desk.file.parent / "hazard").exists(), "the end of the flood")
-    expect(desk.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
-    desk.button("Clear").click()
-    expect(desk.page.get_by_text("Nothing printed so far.")).to_be_visible()
