@@ -3,31 +3,31 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.far_line import FarLine, line_to
-from tests.drive.page import page_at
+from tests.drive.page import close_notice, page_at
 from tests.drive.panels import drop_viser
+from tests.drive.served import redrawn, served
 from tests.drive.waiting import until
 from workbench.cameras.commands import PickPixel
-from workbench.commands import COMMANDS
 from workbench.library.commands import OpenRow, PressRow
 from workbench.live.commands import PauseLog, ResetAll, SetSeed, Step, TogglePlay
 from workbench.live.env_commands import SelectEnv
-from workbench.live.timeline_commands import Seek
+from workbench.live.timeline_commands import Seek, StepBack
 from workbench.page.command import Command, Refused
 from workbench.page.commands import FrameScene
-from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.gated_server import GatedServer
 from workbench.page.widgets.fields import Field, tick
 from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.templates import asks
-from workbench.page.widgets.visitors import PATH, Visitor, Visitors
+from workbench.page.widgets.visitors import Visitor
 
 pytestmark = pytest.mark.browser
 ROWS = 12
@@ -75,53 +75,47 @@ class SmallPage:
 
 @pytest.fixture(scope="module")
 def opened(browser: Browser) -> Iterator[SmallPage]:
-    gated_server = open_server(ServerOptions(port=0))
-    server, visitors = gated_server.server, Visitors(gated_server.server, COMMANDS)
-    gated_server.add_channel(PATH, visitors.serve)
-    seed = Field(server, "Seed", SetSeed, "seed", "7")
-    pause = tick(server, "Pause", PauseLog, "on", False)
-    strip = part(Seek(step=0), "strip", along='["step", 0, 100]') + part(
-        PickPixel(x=0.0, y=0.0), "picture", place=""
-    )
-    server.gui.add_html(strip + part(PressRow(id="a"), "recording", held="held", twice=asks(OpenRow(id="a"))))
-    rows = server.gui.add_html("")
-    register(server, visitors, {Step, ResetAll, TogglePlay, FrameScene}, "live page")
-    ending = threading.Event()
     with (
+        served() as (gated_server, visitors),
         line_to(gated_server.url, delay=DELAY_SECONDS) as far,
-        page_at(browser, gated_server.url) as (page, errors),
     ):
-        small = SmallPage(gated_server, page, far)
-        visitors.do = small.do
+        server = gated_server.server
+        seed = Field(server, "Seed", SetSeed, "seed", "7")
+        pause = tick(server, "Pause", PauseLog, "on", False)
+        strip = part(Seek(step=0), "strip", along='["step", 0, 100]')
+        picture = part(PickPixel(x=0.0, y=0.0), "picture", place="")
+        recording = part(PressRow(id="a"), "recording", held="held", twice=asks(OpenRow(id="a")))
+        server.gui.add_html(strip + picture + recording)
+        rows = server.gui.add_html("")
+        register(server, visitors, {Step, StepBack, ResetAll, TogglePlay, FrameScene}, "live page")
+        count = 0
 
         def draw() -> None:
-            count = 0
-            while not ending.wait(1 / 60):
-                if not small.still:
-                    count += 1
-                    order = range(ROWS - 1, -1, -1) if small.swapped else range(ROWS)
-                    rows.content = "".join(
-                        part(SelectEnv(env=env), f"env {env}, drawing {count}") for env in order
-                    )
-                seed.show(str(small.seed))
-                pause.show(small.drawn_pause)
+            nonlocal count
+            if not small.still:
+                count += 1
+                order = range(ROWS - 1, -1, -1) if small.swapped else range(ROWS)
+                rows.content = "".join(
+                    part(SelectEnv(env=env), f"env {env}, drawing {count}") for env in order
+                )
+            seed.show(str(small.seed))
+            pause.show(small.drawn_pause)
 
-        drawing = threading.Thread(target=draw, daemon=True)
-        drawing.start()
-        page.wait_for_selector("[data-page]", state="attached")
-        expect(page.get_by_text("recording")).to_be_visible()
-        yield small
-        ending.set()
-        drawing.join()
-        assert not errors
-    gated_server.close()
+        with page_at(browser, gated_server.url) as (page, errors):
+            small = SmallPage(gated_server, page, far)
+            visitors.do = small.do
+            with redrawn(draw, 1 / 60):
+                page.wait_for_selector("[data-page]", state="attached")
+                expect(page.get_by_text("recording")).to_be_visible()
+                yield small
+            assert not errors
 
 
 @pytest.fixture
 def small(opened: SmallPage) -> SmallPage:
+    opened.page.evaluate("document.activeElement.blur()")
     opened.seed, opened.swapped, opened.still, opened.drawn_pause = 7, False, False, False
     expect(opened.page.get_by_label("Seed")).to_have_value("7")
-    opened.page.evaluate("document.activeElement.blur()")
     opened.came.clear()
     return opened
 
@@ -189,14 +183,26 @@ def test_typed_input_is_committed_before_the_following_command(browser: Browser,
         assert not errors
 
 
-@pytest.mark.parametrize("typed", ["5000000000", "1.5", "NaN", "-1", "abc", "100", ""])
+@pytest.mark.parametrize(
+    ("typed", "why"),
+    [
+        ("5000000000", "2147483647"),
+        ("1.5", "1.5 is not"),
+        ("-1", "from 0"),
+        ("NaN", "NaN"),
+        ("100", str(MAX_SEED)),
+        ("abc", "abc"),
+        ("", "empty"),
+    ],
+)
 def test_an_invalid_seed_is_refused_with_a_reason_and_the_field_restored(
-    small: SmallPage, typed: str
+    small: SmallPage, typed: str, why: str
 ) -> None:
     field = small.page.get_by_label("Seed")
     field.fill(typed)
     small.page.keyboard.press("Enter")
-    expect(small.page.locator(".mantine-Notification-root, .wb-not-taken").last).to_be_visible()
+    refusal = small.page.locator(".mantine-Notification-root, .wb-not-taken").filter(has_text=why)
+    expect(refusal.last).to_be_visible()
     expect(field).to_have_value("7")
     small.page.keyboard.press("s")
     small.has(Step())
@@ -246,6 +252,20 @@ def test_a_value_changed_by_another_command_is_shown_as_soon_as_it_is_drawn(smal
     assert field.input_value() == "66"
 
 
+def test_a_number_is_entered_once_it_is_complete_and_stepped_by_the_arrow_keys(small: SmallPage) -> None:
+    field = small.page.get_by_label("Seed")
+    field.fill("12")
+    small.page.wait_for_timeout(1000)  # longer than any debounce
+    expect(field).to_have_value("12")
+    assert small.came == []
+    small.page.keyboard.press("ArrowUp")
+    small.has(SetSeed(seed=13))
+    expect(field).to_have_value("13")
+    field.fill("1e1")
+    small.page.keyboard.press("ArrowDown")
+    small.has(SetSeed(seed=13), SetSeed(seed=9))
+
+
 def test_escape_restores_a_field(small: SmallPage) -> None:
     field = small.page.get_by_label("Seed")
     field.fill("55")
@@ -270,6 +290,7 @@ def test_a_held_key_repeats_where_that_makes_sense(small: SmallPage) -> None:
         ("{key: '\u044b', code: 'KeyS'}", [Step()]),  # a Cyrillic layout
         ("{key: 's', code: 'KeyO'}", [Step()]),  # Dvorak
         ("{key: 'R', code: 'KeyR', shiftKey: true}", [ResetAll()]),
+        ("{key: 'r', code: 'KeyR'}", []),
         ("{key: 's', code: 'KeyS', isComposing: true}", []),  # an input method
         ("{key: 's', code: 'KeyS', altKey: true}", []),
         ("{key: 's', code: 'KeyS', ctrlKey: true}", []),
@@ -291,6 +312,28 @@ RELEASE_FRAMES_JS = """() => {
     window.requestAnimationFrame = frameOf;
     for (const then of window.heldFrames) requestAnimationFrame(then);
 }"""
+
+
+@pytest.mark.slow
+def test_command_keys_do_not_move_the_view(small: SmallPage) -> None:
+    page = small.page
+    (client,) = small.gated_server.server.get_clients().values()
+    until(lambda: client.camera.image_width > 300, "the view")
+    close_notice(page)  # it stands where the view is dragged
+    before = client.camera.position.copy()
+    for key in ("s", "ArrowLeft", "w", "e", "ArrowUp"):
+        page.keyboard.down(key)
+        page.wait_for_timeout(300)  # viser moves its view while a key is down
+        page.keyboard.up(key)
+    until(lambda: {*map(type, small.came)} == {Step, StepBack}, "the commands", seen=lambda: small.came)
+    # View updates arrive in order: after that of a drag, all earlier ones have arrived.
+    np.testing.assert_allclose(client.camera.position, before, atol=1e-6)
+    page.mouse.move(200, 400)
+    page.mouse.down()
+    page.mouse.move(260, 400, steps=6)
+    page.mouse.up()
+    until(lambda: not np.allclose(client.camera.position, before), "the view that is dragged")
+    assert client.camera.position[2] == pytest.approx(before[2], abs=1e-3), "a key moved the view"
 
 
 def test_letters_typed_before_the_palette_has_opened_go_into_its_field(small: SmallPage) -> None:
