@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 
@@ -13,8 +12,9 @@ from tests.browser.conftest import RECORDINGS, At
 from tests.drive.desk import Desk
 from tests.drive.studio import HEIGHT, WIDTH, end_of_the_left_arrow, numbers
 from tests.drive.waiting import until
+from tests.episodes.verify_rrd import verify_rrd
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 TABS = ("Cameras", "Reward", "Inspect", "Try", "Checks", "Episodes", "Log", "Run")
 
 
@@ -39,21 +39,9 @@ def expect_on_every_tab(desk: Desk, mark: Locator) -> None:
         expect(mark).to_be_visible()
 
 
-@pytest.mark.slow
-def test_letters_typed_outside_a_field_reset_and_record_nothing(desk: Desk) -> None:
-    desk.tab("Reward")
-    desk.press("Shift+R", "s", "s")
-    desk.comes_to(2)
-    desk.leave_inputs()
-    desk.press(*"ricugi")  # i twice: the handles at the arm go again
-    desk.press("s")
-    desk.comes_to(3)
-    expect(desk.page.locator(".wb-sight-rec")).to_have_count(0)
-
-
-@pytest.mark.slow
-def test_recording_is_shown_on_every_tab_and_in_the_title(desk: Desk) -> None:
-    mark = desk.page.locator(".wb-sight-rec")
+def test_recording_is_shown_on_every_tab_and_in_the_title_and_its_file_is_named(desk: Desk) -> None:
+    mark, folder = desk.page.locator(".wb-sight-rec"), desk.file.parent / RECORDINGS
+    before = set(folder.glob("*.rrd"))
     desk.tab("Reward")
     desk.press("Shift+C")
     expect(mark).to_have_text(re.compile(r"REC\s+env 0 · 0 episodes · since \d\d:\d\d · stop"))
@@ -67,9 +55,12 @@ def test_recording_is_shown_on_every_tab_and_in_the_title(desk: Desk) -> None:
     mark.get_by_text("stop").click()
     expect(mark).to_have_count(0)
     expect(desk.page).not_to_have_title(re.compile("REC"))
+    desk.tab("Episodes")
+    (written,) = until(lambda: set(folder.glob("*.rrd")) - before, "the file")
+    assert verify_rrd(written) is None
+    expect(desk.page.get_by_text(written.name).first).to_be_visible()
 
 
-@pytest.mark.slow
 def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
     mark = desk.page.locator(".wb-sight-moved")
     desk.tab("Cameras")
@@ -104,33 +95,3 @@ def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
     mark.get_by_text("undo").click()
     expect(mark).to_have_count(0)
     until(lambda: numbers(desk.page, "Position") == [0.45, 0, 0.6], "where the file has it")
-
-
-@pytest.mark.slow
-def test_the_review_shows_that_a_camera_was_moved(desk: Desk) -> None:
-    page = desk.page
-    desk.tab("Cameras")
-    until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "the camera")
-    desk.leave_inputs()
-    desk.press("Alt+ArrowUp")
-    expect(page.locator(".wb-sight-moved")).to_be_visible()
-    folder = desk.file.parent / RECORDINGS
-    before = set(folder.glob("*.json"))
-    desk.press("Shift+C", "s", "s")
-    expect(page.locator(".wb-timeline")).to_contain_text("step 2")
-    desk.press("Shift+C")
-    (file,) = until(lambda: set(folder.glob("*.json")) - before, "the files")
-    (moved,) = json.loads(file.read_text())["workbench"]["moved_cameras"]
-    assert (
-        moved["in_file"]["position"] == pytest.approx([0.45, 0, 0.6]) and moved["used"]["position"][2] > 0.605
-    )
-    desk.press("v")
-    expect(page.get_by_role("tab", name="Review")).to_be_visible()
-    if not page.locator(".wb-library tbody").count():
-        desk.press("b")
-    page.locator(".wb-library tbody").first.click()
-    desk.press("Enter")
-    expect(page.locator(".wb-facts")).to_contain_text(re.compile(r"camera moved\s*base_camera: position"))
-    desk.press("v")
-    page.locator(".wb-sight-moved").get_by_text("undo").click()
-    expect(page.locator(".wb-sight-moved")).to_have_count(0)
