@@ -18,9 +18,6 @@ STEPS = 12
 @pytest.fixture(scope="module")
 def opened(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
     with example_without_pictures(browser) as desk:
-        (desk.file.parent / "pusher.py").write_text(
-            "def careful(obs):\n    return obs.new_zeros((len(obs), 8))\n"
-        )
         yield desk
         assert desk.errors == []
 
@@ -103,13 +100,3 @@ def test_a_click_on_a_curve_shows_its_step(desk: Desk) -> None:
     assert 0 < shown < STEPS
     desk.press("End")
     desk.comes_to(STEPS)
-
-
-def test_a_policy_is_chosen_from_those_in_the_folder(desk: Desk) -> None:
-    desk.page.get_by_label("Source").select_option(label="policy")
-    desk.page.get_by_label("Known").select_option(label="pusher.py:careful")
-    expect(desk.page.get_by_label("Known")).to_have_value('"pusher.py:careful"')
-    desk.leave_inputs()
-    desk.press("s")
-    desk.timeline_says("step 1 /")
-    desk.page.get_by_label("Source").select_option(label="random")
