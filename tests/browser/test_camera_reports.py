@@ -1,4 +1,4 @@
-"""A camera measured, compared, searched and exported in a real Chromium, over real envs."""
+"""A camera looked through, searched and exported in a real Chromium, over real envs."""
 
 from __future__ import annotations
 
@@ -12,21 +12,14 @@ import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.browser.conftest import At
-from tests.drive.studio import press as press_tool
-from tests.drive.studio import tool
+from tests.drive.studio import back_to_the_file
 from tests.drive.waiting import until
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-ENVS = 2
 CAMERA = "base_camera"
 PICTURE = "img[src^='blob:']:visible"
-FOLDERS = {
-    "Measure": "Measure this camera",
-    "Compare": "Keep this placement as A",
-    "Suggest a placement": "Search",
-    "Matrices and files": "Download",
-}
-"""Report folders, and a button in each."""
+FOLDERS = {"Suggest a placement": "Search", "Matrices and files": "Download"}
+"""Folders, and a button in each."""
 
 PLACES_OF_A_PILL = """
 window.places = [];
@@ -63,18 +56,6 @@ def page(opened: Page) -> Page:
     return opened
 
 
-def back_to_the_file(page: Page) -> None:
-    status = page.get_by_text(re.compile("^As in push_cube.py"))
-
-    def back() -> bool:
-        # A new part is scrolled into view, and a press in progress would miss its button.
-        if "wb-off" not in tool(page, "Reset to file")["classes"]:
-            press_tool(page, "Reset to file")
-        return status.is_visible()
-
-    until(back, "the camera at the file's pose")
-
-
 def press(page: Page, name: str) -> None:
     page.get_by_role("button", name=name, exact=True).click()
 
@@ -105,24 +86,6 @@ def test_a_press_on_the_picture_shows_body_depth_and_point(page: Page) -> None:
     x, y, z, one = shown_matrix(page) @ [*point, 1]
     assert one == 1 and abs(z - depth) < 1e-3 and x < 0 and y > 0
     assert abs(x + y) < 0.02  # a square picture: equally far left and down
-
-
-def test_a_report_suggests_planes_and_is_outdated_once_they_are_used(page: Page) -> None:
-    press(page, "Measure this camera")
-    expect(page.get_by_text(f"{ENVS} envs now")).to_be_visible()
-    row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
-    expect(row.locator("td").nth(1)).to_have_text("100 %")
-    pixels, of_picture = row.locator("td").nth(2).inner_text().split("\n")
-    assert float(pixels.removesuffix(" px")) > 10 and of_picture.endswith(" %")
-    expect(page.get_by_text("measure again")).to_have_count(0)
-    press(page, "Keep this placement as A")
-    page.locator(".wb-planes [data-do]").last.click()
-    expect(page.get_by_text("measure again")).to_be_visible()
-    press(page, "Show side by side")
-    expect(page.locator(".wb-pair img")).to_have_count(2)
-    expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
-    press(page, "Return to A")
-    expect(page.get_by_text("measure again")).to_have_count(0)
 
 
 def test_a_downloaded_calibration_places_the_camera_again(page: Page) -> None:

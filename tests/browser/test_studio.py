@@ -16,6 +16,7 @@ from tests.drive.studio import (
     HEIGHT,
     VIEW,
     WIDTH,
+    back_to_the_file,
     choose,
     end_of_the_left_arrow,
     numbers,
@@ -56,9 +57,7 @@ def page(opened: Page) -> Page:
     """The page with base_camera chosen, at the pose in the file."""
     choose(opened, "base_camera · sensor")
     expect(opened.get_by_text("Show the change", exact=True)).to_be_visible()
-    if "wb-off" not in tool(opened, "Reset to file")["classes"]:
-        press(opened, "Reset to file")
-    expect(opened.get_by_text(re.compile("^As in push_cube.py"))).to_be_visible()
+    back_to_the_file(opened)
     unfold(opened, "Rotation", opened.get_by_label("Written as"))
     return opened
 
@@ -123,8 +122,7 @@ def test_a_camera_is_dragged_written_to_the_file_checked_and_undone(page: Page, 
     x, y = end_of_the_left_arrow(page) or (0, 0)
     page.mouse.move(x, y)
     page.mouse.down()
-    for i in range(1, 5):
-        page.mouse.move(x + 10 * i, y)
+    page.mouse.move(x + 40, y, steps=4)
     # While the mouse button is still down.
     until(lambda: numbers(page, "Position")[1] > 0.05, "the number")
     until(lambda: picture(page) not in ("", before), "another picture")
@@ -191,8 +189,7 @@ def test_a_camera_is_rotated_with_the_mouse(page: Page) -> None:
     x, y = arc_about_x(page) or (0, 0)
     page.mouse.move(x, y)
     page.mouse.down()
-    for i in range(1, 6):
-        page.mouse.move(x + 3 * i, y + 5 * i)
+    page.mouse.move(x + 15, y + 25, steps=5)
     until(lambda: numbers(page, "Degrees") != start, "the angles")
     until(lambda: picture(page) not in ("", before), "another picture")
     page.mouse.up()

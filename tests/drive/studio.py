@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import FloatRect, Page
@@ -40,6 +42,19 @@ def tool(page: Page, name: str) -> dict:
 
 def press(page: Page, name: str) -> None:
     page.mouse.click(*tool(page, name)["at"])
+
+
+def back_to_the_file(page: Page) -> None:
+    """Put the chosen camera of push_cube.py where the file has it."""
+    status = page.get_by_text(re.compile("^As in push_cube.py"))
+
+    def back() -> bool:
+        # A new part is scrolled into view, and a press in progress would miss its button.
+        if "wb-off" not in tool(page, "Reset to file")["classes"]:
+            press(page, "Reset to file")
+        return status.is_visible()
+
+    until(back, "the camera at the file's pose")
 
 
 def numbers(page: Page, label: str) -> list[float]:
