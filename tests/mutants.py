@@ -55,13 +55,10 @@ PROTECTED = {
     "task/registry": "task/test_registry.py",
     "task/modules": "task/test_load.py task/test_task_content.py task/test_library_names.py"
     " task/test_named_modules.py",
-    "source/parsed": "cameras/edit/test_which_camera.py cameras/edit/test_edits.py"
-    " cameras/edit/test_edits.py source/test_read_values.py",
+    "source/parsed": "cameras/edit/test_which_camera.py cameras/edit/test_edits.py source/test_read_values.py",
     "source/read_values": "source/test_read_values.py cameras/edit/test_edits.py"
     " cameras/edit/test_which_camera.py",
-    "source/traced_edits": "cameras/edit/test_edits.py"
-    " cameras/edit/test_which_camera.py cameras/edit/test_rotations.py"
-    " cameras/edit/test_edits.py",
+    "source/traced_edits": "cameras/edit/test_edits.py cameras/edit/test_which_camera.py cameras/edit/test_rotations.py",
     "source/definitions": "source/test_read_values.py cameras/edit/test_edits.py"
     " cameras/edit/test_which_camera.py",
     "task/write_edits": "task/test_write_edits.py",
@@ -102,7 +99,7 @@ PROTECTED = {
     "live/loading": "live/test_versions.py live/test_live_state.py",
     "live/apply": "live/test_live_state.py live/test_timeline.py live/test_apply.py",
     "live/past": "live/test_timeline.py",
-    "live/reading": "live/test_live_state.py",
+    "live/inspect_polling": "live/test_live_state.py",
     "actions/choose": "actions/test_given_actions.py",
     "record/live_recorder": "record/test_live_recorder.py",
     "record/state": "record/test_apply.py record/test_live_recorder.py",
