@@ -27,16 +27,7 @@ LIKE_ANOTHER = {
 }
 """Excluded: a target speed or a difficulty level sets them apart from a task that is included. `envs/test_every_task.py` opens them too."""
 IN_PROCESSES = (
-    *(
-        "cameras",
-        "custom_scene",
-        "different_objects",
-        "obs_history",
-        "own_robot",
-        "push_cube",
-        "swing_up",
-        "two_robots",
-    ),
+    *"cameras custom_scene different_objects obs_history own_robot push_cube swing_up two_robots".split(),
     *BUILT_IN_SAMPLES,
 )
 """Tasks that are also tested in processes, with default options."""

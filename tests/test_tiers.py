@@ -66,15 +66,10 @@ def test_a_test_without_the_fixture_for_what_it_uses_fails_and_names_it(
     outcomes = {
         name: outcome for outcome, name in re.findall(r"^(PASSED|FAILED) \S+::(\w+)", output, re.MULTILINE)
     }
-    in_threads = ("test_in_a_thread", "test_waits_for_it")
-    without_fixture = (
-        "test_says_nothing",
-        "test_forks",
-        *in_threads,
-        "test_swallowed",
-        "test_renders_unsaid",
+    without_fixture = "says_nothing forks in_a_thread waits_for_it swallowed renders_unsaid".split()
+    assert outcomes == {"test_plain": "PASSED", **{f"test_{name}": "FAILED" for name in without_fixture}}, (
+        output
     )
-    assert outcomes == {"test_plain": "PASSED", **dict.fromkeys(without_fixture, "FAILED")}, output
     assert " 5 deselected" in output and "fixture `renderer`" in output, output
     assert output.count("ask for the fixture `child_process`") >= 5, output
     assert "did not come within" not in output, output
