@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
+from tests.drive.tabs import handshake
 from tests.drive.waiting import until
 from workbench.page.door.access import cookie_name
 from workbench.page.door.gated_server import GatedServer
@@ -86,14 +87,8 @@ def both(gated_server: GatedServer, **headers: str | None) -> tuple[int, int]:
 def client(gated_server: GatedServer) -> Iterator[Connection]:
     """An authenticated client that viser counts as connected; incoming messages are discarded."""
     known = set(gated_server.server.get_clients())
-    with connect(
-        f"ws://127.0.0.1:{gated_server.port}",
-        subprotocols=[PROTOCOL],  # type: ignore[list-item]
-        origin=f"http://127.0.0.1:{gated_server.port}",  # type: ignore[arg-type]
-        additional_headers={"Cookie": cookie_of(gated_server)},
-        max_size=None,
-        close_timeout=0.2,
-    ) as connection:
+    address, options = handshake(gated_server.url)
+    with connect(address, close_timeout=0.2, **options) as connection:
         say(connection, CAMERA)
         until(lambda: set(gated_server.server.get_clients()) - known, "the client")
         yield connection
