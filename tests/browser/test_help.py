@@ -13,6 +13,7 @@ from tests.drive.page import page_at
 from workbench.app import help_pages
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
+pytestmark = pytest.mark.slow
 BROKEN = (
     "[...document.images].filter(one => !one.complete || one.naturalWidth < 20).map(one => one.currentSrc)"
 )
@@ -27,7 +28,6 @@ def served(child_process: None) -> Iterator[GatedServer]:
     gated_server.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_every_page_of_the_docs_opens_with_its_pictures(
     served: GatedServer, browser: Browser, theme: str
@@ -56,7 +56,6 @@ def test_every_page_of_the_docs_opens_with_its_pictures(
         assert errors == []
 
 
-@pytest.mark.slow
 def test_a_link_to_a_section_shows_that_section(served: GatedServer, browser: Browser) -> None:
     with page_at(browser, served.addresses("/help/tasks")[0]) as (page, errors):
         page.get_by_role("link", name="rules", exact=True).click()
@@ -67,7 +66,6 @@ def test_a_link_to_a_section_shows_that_section(served: GatedServer, browser: Br
         assert errors == []
 
 
-@pytest.mark.slow
 def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
     with example_without_pictures(browser) as desk:
         search = desk.page.get_by_placeholder("Search commands...")
@@ -99,7 +97,6 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
         expect(desk.button("Play")).to_be_visible()
 
 
-@pytest.mark.slow
 def test_the_documents_can_be_searched(served: GatedServer, browser: Browser) -> None:
     with page_at(browser, served.addresses("/help/")[0]) as (page, errors):
         search = page.get_by_role("searchbox", name="Search the documents")
@@ -111,7 +108,6 @@ def test_the_documents_can_be_searched(served: GatedServer, browser: Browser) ->
         assert errors == []
 
 
-@pytest.mark.slow
 def test_a_file_of_the_task_opens_in_the_editor_from_the_palette(
     example_without_pictures: At, browser: Browser
 ) -> None:
