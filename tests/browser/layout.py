@@ -1,4 +1,4 @@
-"""Finds layout defects: text that is cut off or covered, buttons that touch."""
+"""Finds layout defects, by functions in JavaScript: text that is cut off or covered, buttons that touch, tabs in two rows."""
 
 FAULTS = r"""() => {
     const faults = new Set();
@@ -99,4 +99,9 @@ FAULTS = r"""() => {
     });
     return [...faults].sort();
 }"""
-"""JavaScript that returns a line for each layout defect on the page."""
+"""Returns a line for each layout defect on the page."""
+TAB_ROWS = "() => new Set([...document.querySelectorAll('[data-dock-region=right] [role=tab]')].map(e => e.offsetTop)).size"
+"""Returns the number of rows of tabs in the right dock."""
+FIELD_FONTS = """() => [...document.querySelectorAll('[data-dock-region=right] .wb-field > :is(span, input[type=text], select)')]
+    .filter(e => e.checkVisibility()).map(e => getComputedStyle(e)).map(s => [s.fontSize, s.fontFamily, s.letterSpacing].join())"""
+"""Returns the font of each visible label and input in the right dock."""

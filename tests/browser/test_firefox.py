@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser.layout import FAULTS
+from tests.browser.layout import FAULTS, FIELD_FONTS, TAB_ROWS
 from tests.browser.tab_pictures import LIVE_TABS
 from tests.drive.firefox import Firefox, open_firefox, why_no_firefox
 from tests.drive.page import TASK, open_workbench
@@ -40,14 +40,10 @@ def page(tmp_path_factory: pytest.TempPathFactory, child_process: None) -> Itera
         yield firefox
 
 
-def step_of(page: Firefox) -> int:
-    return int(re.findall(r"env 0: step (\d+)", page.text())[0])
-
-
 def test_it_plays(page: Firefox) -> None:
     page.click("[role=tab]", "Run")
     page.click("[role=button]", "Play")
-    until(lambda: step_of(page) > 3, "steps", 120, page.text)
+    until(lambda: int(re.findall(r"env 0: step (\d+)", page.text())[0]) > 3, "steps", 120, page.text)
     page.click("[role=button]", "Pause")
     until(lambda: "paused" in page.text(), "the pause")
 
@@ -65,9 +61,7 @@ def test_each_tab_opens_and_nothing_is_cut_off_or_covered(page: Firefox, tab: st
             "a picture",
             120,
         )
-    rows = "[...document.querySelectorAll('[data-dock-region=right] [role=tab]')].map(e => e.offsetTop)"
-    tops = page.evaluate(rows)
-    assert len(tops) == len(LIVE_TABS) and len(set(tops)) == 1, "the tabs are in one row"
+    assert page.evaluate(f"({TAB_ROWS})()") == 1
     until(
         lambda: page.evaluate(f"({FAULTS})()") == [],
         "nothing cut or covered",
@@ -87,10 +81,7 @@ def test_each_tab_opens_and_nothing_is_cut_off_or_covered(page: Firefox, tab: st
 
 def test_inputs_use_the_font_of_their_labels(page: Firefox) -> None:
     page.click("[role=tab]", "Run")
-    fonts = page.evaluate(
-        "[...document.querySelectorAll('[data-dock-region=right] .wb-field > :is(span, input[type=text], select)')]"
-        ".filter(e => e.checkVisibility()).map(e => getComputedStyle(e)).map(s => [s.fontSize, s.fontFamily].join())"
-    )
+    fonts = page.evaluate(f"({FIELD_FONTS})()")
     assert len(fonts) > 6 and len(set(fonts)) == 1, set(fonts)
 
 

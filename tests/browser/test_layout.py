@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.conftest import At
-from tests.browser.layout import FAULTS
+from tests.browser.layout import FAULTS, FIELD_FONTS, TAB_ROWS
 from tests.browser.tab_pictures import GOLDEN, LIVE_TABS, REVIEW_TABS
 from tests.drive.desk import Desk
 from tests.drive.page import close_notice, open_workbench, page_at, picture_of_view
@@ -64,10 +64,6 @@ def faults(page: Page) -> list[str]:
     return found
 
 
-def width_of(page: Page, what: str) -> float:
-    return page.evaluate("s => document.querySelector(s).parentElement.getBoundingClientRect().width", what)
-
-
 def faults_of_all_tabs(page: Page, tabs: tuple[str, ...], table: str) -> dict[str, list[str]]:
     found = {}
     for tab in tabs:
@@ -115,15 +111,9 @@ def test_each_layout_defect_is_found(desk: Desk) -> None:
 def test_all_tabs_are_in_one_row_and_inputs_use_the_font_of_their_labels(desk: Desk) -> None:
     for name in LIVE_TABS:
         desk.tab(name)
-        rows = desk.page.evaluate(
-            "() => [...document.querySelectorAll('[role=tab]')].filter(e => e.closest('[data-dock-region=right]')).map(e => e.offsetTop)"
-        )
-        assert len(rows) == len(LIVE_TABS) and len(set(rows)) == 1
+        assert desk.page.evaluate(TAB_ROWS) == 1
     desk.tab("Run")
-    fonts = desk.page.evaluate(
-        "() => [...document.querySelectorAll('.wb-field > :is(span, input[type=text], select)')].filter(e => e.offsetParent && e.closest('[data-dock-region=right]')).map(e => getComputedStyle(e))"
-        ".map(s => [s.fontSize, s.fontFamily, s.letterSpacing].join())"
-    )
+    fonts = desk.page.evaluate(FIELD_FONTS)
     assert len(fonts) > 6 and len(set(fonts)) == 1, set(fonts)
 
 
@@ -168,7 +158,7 @@ def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, br
         rows.last.click()
         page.keyboard.press("Enter")
         expect(rows).to_have_count(0)
-        for width, height in ((1280, 720), (1440, 900), (1920, 1080)):
+        for width, height in SIZES:
             page.set_viewport_size({"width": width, "height": height})
             for theme in ("dark", "light"):
                 seen = faults_of_all_tabs(page, REVIEW_TABS, "Library folded or not")
