@@ -11,7 +11,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at, picture_of_view
@@ -19,10 +18,10 @@ from tests.drive.waiting import until
 from workbench.machine.maniskill_installed import installed_maniskills
 from workbench.start.registered import LIST_FILE
 from workbench.task.new_task import TEMPLATES
-from workbench.trust.consent_dialog import DO_NOT, ONCE
+from workbench.trust.consent_dialog import ONCE
 
 # The first test needs the start page, which is gone once a task is open.
-pytestmark = [pytest.mark.browser, pytest.mark.random_order(disabled=True)]
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.random_order(disabled=True)]
 TIMEOUT_MS = 120_000
 NOT_FOUND = "NoSuchTask-v1"
 
@@ -75,11 +74,6 @@ def runs(page: Page, title: str, envs: str = "2 envs") -> None:
     expect(status).to_contain_text("paused", timeout=TIMEOUT_MS)
 
 
-def view_of(page: Page) -> NDArray[np.uint8]:
-    """Pixels in the middle of the 3-D view."""
-    return picture_of_view(page, {"x": 300, "y": 350, "width": 400, "height": 130})
-
-
 def open_list(page: Page) -> None:
     """Open the dialog; while no task is open, the list is already there."""
     expect(page.locator(".wb-status, .wb-start").first).to_be_visible(timeout=TIMEOUT_MS)
@@ -89,43 +83,6 @@ def open_list(page: Page) -> None:
         expect(page.get_by_role("dialog").locator(".wb-tasks")).to_be_visible()
 
 
-@pytest.mark.slow
-def test_the_list_follows_its_folder_and_accepts_a_path(
-    started: Opened, folder: Path, browser: Browser
-) -> None:
-    with page_at(browser, started.url) as (page, errors):
-        expect(row(page, "push.py")).to_be_visible(timeout=TIMEOUT_MS)
-        close_notice(page)
-        shutil.copy(TASK, folder / "work/a_new_one.py")
-        (folder / "work/broken.py").write_text("class Task(BaseEnv):\n    def evaluate(self)\n")
-        expect(row(page, "a_new_one.py")).to_be_attached()
-        expect(row(page, "broken.py")).to_contain_text("line 2")
-        (folder / "work/a_new_one.py").rename(folder / "work/renamed.py")
-        expect(row(page, "renamed.py")).to_be_attached()
-        expect(row(page, "a_new_one.py")).to_have_count(0)
-        for name in ("renamed.py", "broken.py"):
-            (folder / "work" / name).unlink()
-            expect(row(page, name)).to_have_count(0)
-        # A wrong path, and one in terminal notation.
-        search = page.get_by_role("textbox").first
-        search.fill(f"{folder}/elsewhere/othr.py")
-        expect(page.locator(".wb-tasks")).to_contain_text("did you mean other.py")
-        search.fill(f" '{folder}/elsewhere/other.py' ")
-        expect(row(page, f"{folder}/elsewhere/other.py")).to_be_visible()
-        expect(marked(page)).to_contain_text("elsewhere/other.py")
-        page.keyboard.press("Enter")
-        # The file is outside the folder: nothing runs without a question.
-        question = page.get_by_role("dialog", name="Run this code?")
-        expect(question).to_contain_text(f"{folder}/elsewhere/other.py", timeout=TIMEOUT_MS)
-        question.get_by_role("button", name=DO_NOT).click()
-        expect(question).to_be_hidden()
-        # All browsers share the search.
-        search.fill("")
-        expect(row(page, "push.py")).to_be_visible()
-        assert errors == []
-
-
-@pytest.mark.slow
 def test_switching_from_the_start_page_to_a_task_to_another_and_back(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -183,7 +140,6 @@ def test_switching_from_the_start_page_to_a_task_to_another_and_back(
         assert errors == []
 
 
-@pytest.mark.slow
 def test_a_new_task_is_created_with_the_mouse_and_opens(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -213,11 +169,11 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
 
 
 def colours(page: Page) -> int:
-    """Number of colours in the 3-D view."""
-    return len(np.unique(view_of(page).reshape(-1, 3), axis=0))
+    """Number of colours in the middle of the 3-D view."""
+    view = picture_of_view(page, {"x": 300, "y": 350, "width": 400, "height": 130})
+    return len(np.unique(view.reshape(-1, 3), axis=0))
 
 
-@pytest.mark.slow
 def test_a_file_with_a_syntax_error_shows_no_other_task_and_opens_once_fixed(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
