@@ -39,7 +39,8 @@ def test_every_page_of_the_docs_opens_with_its_pictures(
         listed = [topic for topic in help_pages.topics() if topic.group != help_pages.RULE_PAGES]
         entries = page.locator("nav li a")
         expect(entries).to_have_count(len(listed))
-        rules = [topic.name for topic in help_pages.topics() if topic not in listed]
+        # They have no pictures: what is too wide is so in both themes.
+        rules = [topic.name for topic in help_pages.topics() if topic not in listed and theme == "dark"]
         for number, name in enumerate([*(topic.name for topic in listed), *rules]):
             if number < len(listed):
                 entries.nth(number).click()
