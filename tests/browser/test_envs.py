@@ -29,7 +29,11 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
         open_tab(page, "Inspect")
         expect(page.get_by_role("cell", name="panda_joint7", exact=True)).to_be_visible()
         until(lambda: envs(page) == list(range(ENVS)), "the rows")
-        play_until_step(page, 6)
+        open_tab(page, "Run")
+        page.get_by_role("button", name="Play", exact=True).click()
+        until(lambda: int(cell(page, 0, 2)) > 6, "steps in the table")
+        page.get_by_role("button", name="Pause", exact=True).click()
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
         yield page
         assert not errors
 
@@ -66,14 +70,6 @@ def cell(page: Page, env: int, column: int) -> str:
     )
 
 
-def play_until_step(page: Page, steps: int) -> None:
-    open_tab(page, "Run")
-    page.get_by_role("button", name="Play", exact=True).click()
-    until(lambda: int(cell(page, 0, 2)) > steps, "steps in the table")
-    page.get_by_role("button", name="Pause", exact=True).click()
-    expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
-
-
 def test_a_press_on_a_row_selects_its_env_also_while_playing(page: Page) -> None:
     open_tab(page, "Run")
     page.get_by_role("button", name="Play", exact=True).click()
@@ -102,13 +98,9 @@ def test_an_outlier_env_is_flagged_with_its_reason_and_found_by_the_filter(page:
     until(lambda: selected(page) == [4], "the flagged env selected by the mark above the tabs")
 
 
-def show(page: Page, what: str) -> None:
-    page.get_by_label("Show", exact=True).locator("visible=true").last.select_option(label=what)
-
-
 def test_a_pose_is_copied(page: Page) -> None:
     open_tab(page, "Inspect")
-    show(page, "bodies")
+    page.get_by_label("Show", exact=True).locator("visible=true").last.select_option(label="bodies")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     expect(page.locator(".wb-leaves").get_by_text("cube", exact=True)).to_be_visible()
     page.locator(".wb-leaves tr", has=page.get_by_text("cube", exact=True)).locator(".wb-pill").click()

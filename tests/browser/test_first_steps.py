@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Locator, expect
+from playwright.sync_api import Browser, expect
 
 from tests.browser.conftest import At
 from tests.drive.desk import Desk
@@ -30,11 +30,6 @@ def desk(opened: Desk) -> Desk:
     opened.press("End", "Shift+R")
     opened.timeline_says("step 0 /")
     return opened
-
-
-def charts(desk: Desk) -> Locator:
-    """The charts, the reward's first."""
-    return desk.page.locator(".wb-chart-area:visible")
 
 
 def test_a_question_mark_lists_the_keys_and_disables_them_meanwhile(desk: Desk) -> None:
@@ -91,8 +86,7 @@ def test_a_click_on_a_curve_shows_its_step(desk: Desk) -> None:
         desk.press("s")
         desk.timeline_says(f"step {step} /")
     desk.tab("Reward")
-    over = charts(desk).first
-    box = over.bounding_box()
+    box = desk.page.locator(".wb-chart-area:visible").first.bounding_box()
     assert box is not None
     desk.page.mouse.click(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.5)
     expect(desk.page.get_by_text(re.compile("past, [1-9]")).first).to_be_visible()

@@ -17,7 +17,7 @@ from tests.drive.desk import Desk
 from tests.drive.page import TASK, page_on
 from tests.drive.waiting import until
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -28,15 +28,10 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
         yield Desk(page, errors, file, opened)
 
 
-def choose(desk: Desk, label: str, option: str) -> None:
-    desk.page.get_by_label(label, exact=True).locator("visible=true").first.select_option(label=option)
-
-
-@pytest.mark.slow
 def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> None:
     page = desk.page
     desk.tab("Run")
-    choose(desk, "Source", "solve")
+    desk.choose("choose_actions", "solve")
     desk.button("Options and results of solve").click()
     expect(page.get_by_text(re.compile("actions are planned by rollouts"))).to_be_visible()
     desk.button("Play").click()
@@ -64,7 +59,6 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> 
     assert desk.errors == []
 
 
-@pytest.mark.slow
 def test_a_pressed_seed_opens_in_the_review_and_back_returns_to_its_row(desk: Desk) -> None:
     """The review last showed its Share tab, with another episode."""
     page = desk.page
