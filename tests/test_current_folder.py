@@ -20,42 +20,12 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 TASK = Path(__file__).parents[1] / "tasks" / "minimal.py"
 COMMAND = Path(sys.executable).with_name("workbench")
-IMPORTED_FIRST = (
-    "pathlib",
-    "json",
-    "random",
-    "queue",
-    "subprocess",
-    "socket",
-    "logging",
-    "tyro",
-    "rich",
-    "msgspec",
-)
-PLANTED = (
+IMPORTED_FIRST = "pathlib json random queue subprocess socket logging tyro rich msgspec".split()
+PLANTED = [
     *IMPORTED_FIRST,
-    *(
-        "numpy",
-        "torch",
-        "multiprocessing",
-        "h5py",
-        "sapien",
-        "mani_skill",
-        "viser",
-        "trimesh",
-        "imageio_ffmpeg",
-    ),
-    *(
-        "workbench",
-        "sitecustomize",
-        "usercustomize",
-        "pyarrow",
-        "PIL",
-        "select",
-        "pickle",
-        "psutil",
-    ),
-)
+    *"numpy torch multiprocessing h5py sapien mani_skill viser trimesh imageio_ffmpeg".split(),
+    *"workbench sitecustomize usercustomize pyarrow PIL select pickle psutil".split(),
+]
 ENVIRONMENT = {**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"}
 
 
