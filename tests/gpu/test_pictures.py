@@ -35,18 +35,18 @@ def pushes(simulation: Simulation, renderer: str) -> Iterator[tuple[Any, Any]]:
         kwargs = {"obs_mode": MODE, "render_backend": renderer}
         return make_env(PushCubeEnv, EnvOptions(N, backend, kwargs=kwargs))
 
-    under_test, rescore = opened(simulation), opened("cpu")
-    yield under_test, rescore
+    under_test, reference = opened(simulation), opened("cpu")
+    yield under_test, reference
     under_test.close()
-    rescore.close()
+    reference.close()
 
 
 @pytest.fixture
 def in_one_state(pushes: tuple[Any, Any]) -> tuple[Any, Any]:
-    under_test, rescore = pushes
-    rescore.reset(seed=[3, 4])
+    under_test, reference = pushes
+    reference.reset(seed=[3, 4])
     under_test.reset(seed=[3, 4])
-    state = rescore.get_state_dict()
+    state = reference.get_state_dict()
     under_test.set_state_dict(
         {
             kind: {name: row.to(under_test.device) for name, row in rows.items()}
@@ -57,7 +57,7 @@ def in_one_state(pushes: tuple[Any, Any]) -> tuple[Any, Any]:
         env.scene._gpu_apply_all()
         env.scene.px.gpu_update_articulation_kinematics()
         env.scene._gpu_fetch_all()
-    return under_test, rescore
+    return under_test, reference
 
 
 def seen(env: Any) -> dict[str, np.ndarray]:
@@ -70,15 +70,15 @@ def cube_pixels(env: Any, segmentation: np.ndarray) -> list[int]:
 
 
 def test_the_same_state_gives_the_same_picture(in_one_state: tuple[Any, Any]) -> None:
-    (env, rescore), (here, there) = in_one_state, map(seen, in_one_state)
+    (env, reference), (here, there) = in_one_state, map(seen, in_one_state)
     names = {
         backend: {int(k): v.name for k, v in backend.segmentation_id_map.items()} for backend in in_one_state
     }
-    assert set(names[env].values()) == set(names[rescore].values())
+    assert set(names[env].values()) == set(names[reference].values())
     for picture in ("rgb", "depth", "segmentation"):
         assert here[picture].shape == there[picture].shape and here[picture].dtype == there[picture].dtype
     name_of = np.vectorize(lambda number, table: table.get(number, "-"), otypes=[object])
-    same = name_of(here["segmentation"], names[env]) == name_of(there["segmentation"], names[rescore])
+    same = name_of(here["segmentation"], names[env]) == name_of(there["segmentation"], names[reference])
     assert same.mean() > 0.99, "only edge pixels may differ"
     inside = same[..., 0]
     np.testing.assert_allclose(

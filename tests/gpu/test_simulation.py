@@ -45,10 +45,10 @@ def opened(task: str, simulation: Simulation, **kwargs: Any) -> TaskEnv:
 @pytest.fixture(scope="module")
 def picks(simulation: Simulation) -> Iterator[tuple[TaskEnv, TaskEnv]]:
     """Yield PickCube on the backend under test and on the batched CPU."""
-    under_test, rescore = opened("PickCube-v1", simulation), opened("PickCube-v1", "cpu")
-    yield under_test, rescore
+    under_test, reference = opened("PickCube-v1", simulation), opened("PickCube-v1", "cpu")
+    yield under_test, reference
     under_test.close()
-    rescore.close()
+    reference.close()
 
 
 def played(env: TaskEnv, steps: int, seed: int = 0) -> Any:
@@ -58,21 +58,16 @@ def played(env: TaskEnv, steps: int, seed: int = 0) -> Any:
     return step  # pyright: ignore[reportPossiblyUnboundVariable]
 
 
-def on_cpu(state: Any) -> Any:
-    """Return ManiSkill's state dict with its tensors on the CPU."""
-    return {k: on_cpu(v) if isinstance(v, dict) else v.cpu() for k, v in state.items()}
-
-
 def test_bodies_actions_and_observations_equal_the_cpus(
     picks: tuple[TaskEnv, TaskEnv], simulation: Simulation
 ) -> None:
-    env, rescore = picks
+    env, reference = picks
     assert env.env.device.type == ("cuda" if simulation == "gpu" else "cpu")
-    assert scene_index(env.env).names == scene_index(rescore.env).names
-    assert [part.names for part in env.parts] == [part.names for part in rescore.parts]
-    assert env.env.action_space == rescore.env.action_space
-    assert env.env.observation_space.shape == rescore.env.observation_space.shape
-    assert env.control_dt == rescore.control_dt
+    assert scene_index(env.env).names == scene_index(reference.env).names
+    assert [part.names for part in env.parts] == [part.names for part in reference.parts]
+    assert env.env.action_space == reference.env.action_space
+    assert env.env.observation_space.shape == reference.env.observation_space.shape
+    assert env.control_dt == reference.control_dt
 
 
 def test_a_seeded_reset_is_repeatable(picks: tuple[TaskEnv, TaskEnv]) -> None:
@@ -107,15 +102,15 @@ def test_a_partial_reset_starts_the_episode_of_its_seed(picks: tuple[TaskEnv, Ta
 
 def test_steps_from_one_state_agree_with_the_cpu(picks: tuple[TaskEnv, TaskEnv]) -> None:
     """The two solvers differ in the last digits; a mixed-up or unapplied pose would differ in the first."""
-    env, rescore = picks
-    rescore.reset(seed=SEEDS)
+    env, reference = picks
+    reference.reset(seed=SEEDS)
     env.reset(seed=SEEDS)
-    state = rescore.env.get_state_dict()
+    state = reference.env.get_state_dict()
     env.env.set_state_dict({k: {n: t.to(env.env.device) for n, t in v.items()} for k, v in state.items()})
     rng = np.random.default_rng(0)
     for _ in range(5):
-        action = actions.random_action(rescore.parts, N, rng)
-        here, there = env.step(action), rescore.step(action)
+        action = actions.random_action(reference.parts, N, rng)
+        here, there = env.step(action), reference.step(action)
     np.testing.assert_allclose(here.poses[..., :3], there.poses[..., :3], atol=0.01)  # pyright: ignore
     turned = np.abs((here.poses[..., 3:] * there.poses[..., 3:]).sum(-1))  # pyright: ignore
     assert turned.min() > 0.995, "orientations must agree (q and -q are the same)"
@@ -218,9 +213,7 @@ def test_steps_after_a_restore_repeat_the_earlier_ones(picks: tuple[TaskEnv, Tas
 
 
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
-def test_an_unapplied_pose_behaves_as_on_the_cpu(
-    picks: tuple[TaskEnv, TaskEnv],
-) -> None:
+def test_an_unapplied_pose_behaves_as_on_the_cpu(picks: tuple[TaskEnv, TaskEnv]) -> None:
     seen = []
     for env in picks:
         env.reset(seed=SEEDS)
