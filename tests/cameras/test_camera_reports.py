@@ -45,7 +45,14 @@ from workbench.cameras.events import (
     SuggestionsWanted,
 )
 from workbench.cameras.export_panel import CameraExport, calibrated_pose, calibration_text, file_name
-from workbench.cameras.report_panel import CameraReportPanel, histogram, percent
+from workbench.cameras.report_panel import (
+    CameraReportPanel,
+    env_words,
+    headline,
+    histogram,
+    object_rows,
+    percent,
+)
 from workbench.cameras.suggest_panel import CameraSuggest, choices_of
 from workbench.cameras.view import (
     EditRequest,
@@ -175,109 +182,100 @@ def view_of_camera(
     return running(1, task=task, studio=studio)
 
 
-def test_a_saved_placement_is_compared_with_the_files_previous_one(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraCompare(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
+class Folder:
+    """One folder of the Studio on a page, with a scripted session."""
 
-    def draw(settings: CameraSettings) -> None:
-        session.shown = view_of_camera(settings, settings)
-        folder.draw(session.shown)
+    def __init__(self, panels: Panels, kind: type, *more: Any) -> None:
+        self.session = StubSession()
+        self.part = kind(panels.server, cast(Any, self.session), *more)
+        panels.visitors.do = self._do
 
-    draw(SETTINGS)
-    panels.set("Now, with", NAMES["before"])
-    panels.press("Show side by side")
-    assert session.asked == [] and "has not changed" in panels.client.notices[-1]
-    draw(replace(SETTINGS, far=50.0))
-    draw(replace(SETTINGS, far=50.0))
-    panels.press("Show side by side")
-    assert session.asked == [ComparisonWanted(SETTINGS)]
-
-
-def test_a_kept_placement_becomes_the_comparison_and_can_be_restored(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraCompare(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
-    session.shown = view_of_camera()
-    folder.draw(session.shown)
-    panels.do(ReturnToKept())
-    assert "is kept yet" in panels.client.notices[-1]
-    panels.press("Keep this placement as A")
-    folder.draw(session.shown)
-    assert panels.field("Now, with").value == NAMES["kept"] and not panels.shows("Return to A")
-    session.shown = view_of_camera(replace(SETTINGS, far=50.0))
-    folder.draw(session.shown)
-    panels.press("Return to A")
-    assert session.asked == [CameraPlaced(("sensor", "base_camera"), SETTINGS)]
-
-
-def test_the_search_box_surrounds_the_eye_until_one_is_typed(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraSuggest(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
-
-    def draw(now: CameraSettings) -> None:
-        session.shown = view_of_camera(now)
-        folder.draw(session.shown)
-
-    draw(SETTINGS)
-    assert panels.field("Search box to").value == (0.6, 0.3, 0.9) and not panels.field("Draw this box").value
-    panels.type("Search box from", 2.0, at=2)
-    panels.type("Search box from", 2000.0, at=1)
-    draw(replace(SETTINGS, position=(1.0, 1.0, 1.0)))
-    assert panels.field("Search box from").value == (0.0, -0.3, 2.0) and panels.field("Draw this box").value
-    panels.set("Resets", 3)
-    panels.press("Search")
-    asked = SuggestionsWanted(("cube",), (0.0, -0.3, 0.9), (0.6, 0.3, 2.0), 3)
-    assert session.asked == [asked], "the corners must be sorted"
-    panels.ask(ToggleWantedObject(name="cube"))
-    panels.press("Search")
-    assert session.asked == [asked] and "at least one object" in panels.client.notices[-1]
-
-
-def test_a_camera_is_measured_over_the_chosen_set(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraReportPanel(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
-    session.shown = view_of_camera()
-    for over, fields, wanted in (
-        ("all envs now", (False, False), MeasureWanted("envs", 32)),
-        ("fresh resets", (False, True), MeasureWanted("resets", 32)),
-        ("this env's episode so far", (True, False), MeasureWanted("steps", 50)),
-    ):
-        folder.draw(session.shown)
-        panels.set("Over", over)
-        folder.draw(session.shown)
-        assert (panels.shows("Steps"), panels.shows("Resets")) == fields
-        panels.press("Measure this camera")
-        assert session.asked[-1] == wanted
-    session.shown = running(1)
-    panels.press("Pictures of all envs")
-    assert len(session.asked) == 3 and "Choose a camera" in panels.client.notices[-1]
-
-
-class Writing:
-    """The folder that requests edits of the file, with a scripted session."""
-
-    def __init__(self, panels: Panels) -> None:
-        self.panels, self.session = panels, StubSession()
-        above = panels.server.gui.add_folder(None)
-        self.part = WriteToFile(panels.server, cast(Any, self.session), lambda _, lens: lens, above)
-        panels.visitors.do = self.do
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        if type(command) in self.part.does:
-            self.part.do(command, visitor)
-        else:
-            self.session.do(command)
+    @property
+    def asked(self) -> list[Any]:
+        return self.session.asked
 
     def draw(self, view: SessionView) -> None:
         self.session.shown = view
         self.part.draw(view)
 
+    def _do(self, command: Command, visitor: Visitor) -> None:
+        if type(command) in self.part.does:
+            self.part.do(command, visitor)
+        else:
+            self.session.do(command)
+
+
+def writing_folder(panels: Panels, look: Callable[..., CameraSettings] = lambda _, lens: lens) -> Folder:
+    """The folder that requests edits of the file; `look` gives an added camera the view of the page."""
+    return Folder(panels, WriteToFile, look, panels.server.gui.add_folder(None))
+
+
+def test_a_saved_placement_is_compared_with_the_files_previous_one(panels: Panels) -> None:
+    folder = Folder(panels, CameraCompare)
+
+    def draw(settings: CameraSettings) -> None:
+        folder.draw(view_of_camera(settings, settings))
+
+    draw(SETTINGS)
+    panels.set("Now, with", NAMES["before"])
+    panels.press("Show side by side")
+    assert folder.asked == [] and "has not changed" in panels.client.notices[-1]
+    draw(replace(SETTINGS, far=50.0))
+    draw(replace(SETTINGS, far=50.0))
+    panels.press("Show side by side")
+    assert folder.asked == [ComparisonWanted(SETTINGS)]
+
+
+def test_a_kept_placement_becomes_the_comparison_and_can_be_restored(panels: Panels) -> None:
+    folder = Folder(panels, CameraCompare)
+    folder.draw(view_of_camera())
+    panels.do(ReturnToKept())
+    assert "is kept yet" in panels.client.notices[-1]
+    panels.press("Keep this placement as A")
+    folder.draw(view_of_camera())
+    assert panels.field("Now, with").value == NAMES["kept"] and not panels.shows("Return to A")
+    folder.draw(view_of_camera(replace(SETTINGS, far=50.0)))
+    panels.press("Return to A")
+    assert folder.asked == [CameraPlaced(("sensor", "base_camera"), SETTINGS)]
+
+
+def test_the_search_box_surrounds_the_eye_until_one_is_typed(panels: Panels) -> None:
+    folder = Folder(panels, CameraSuggest)
+    folder.draw(view_of_camera())
+    assert panels.field("Search box to").value == (0.6, 0.3, 0.9) and not panels.field("Draw this box").value
+    panels.type("Search box from", 2.0, at=2)
+    panels.type("Search box from", 2000.0, at=1)
+    folder.draw(view_of_camera(replace(SETTINGS, position=(1.0, 1.0, 1.0))))
+    assert panels.field("Search box from").value == (0.0, -0.3, 2.0) and panels.field("Draw this box").value
+    panels.set("Resets", 3)
+    panels.press("Search")
+    asked = SuggestionsWanted(("cube",), (0.0, -0.3, 0.9), (0.6, 0.3, 2.0), 3)
+    assert folder.asked == [asked], "the corners must be sorted"
+    panels.ask(ToggleWantedObject(name="cube"))
+    panels.press("Search")
+    assert folder.asked == [asked] and "at least one object" in panels.client.notices[-1]
+
+
+def test_a_camera_is_measured_over_the_chosen_set(panels: Panels) -> None:
+    folder = Folder(panels, CameraReportPanel)
+    for over, fields, wanted in (
+        ("all envs now", (False, False), MeasureWanted("envs", 32)),
+        ("fresh resets", (False, True), MeasureWanted("resets", 32)),
+        ("this env's episode so far", (True, False), MeasureWanted("steps", 50)),
+    ):
+        folder.draw(view_of_camera())
+        panels.set("Over", over)
+        folder.draw(view_of_camera())
+        assert (panels.shows("Steps"), panels.shows("Resets")) == fields
+        panels.press("Measure this camera")
+        assert folder.asked[-1] == wanted
+    folder.session.shown = running(1)
+    panels.press("Pictures of all envs")
+    assert len(folder.asked) == 3 and "Choose a camera" in panels.client.notices[-1]
+
 
 def test_only_the_shown_change_can_be_saved(panels: Panels) -> None:
-    writing, moved = Writing(panels), replace(SETTINGS, far=50.0)
+    writing, moved = writing_folder(panels), replace(SETTINGS, far=50.0)
     planned = EditState("planned", EditRequest("edit", ("sensor", "base_camera"), SETTINGS))
     writing.draw(view_of_camera())
     assert panels.button("Show the change").command is None and not panels.shows("Save")
@@ -287,11 +285,11 @@ def test_only_the_shown_change_can_be_saved(panels: Panels) -> None:
     assert not panels.shows("Save") and panels.shows("Discard the change")
     writing.draw(view_of_camera(edit_state=planned))
     panels.press("Save")
-    assert writing.session.asked == [SaveCameraChange()]
+    assert writing.asked == [SaveCameraChange()]
 
 
 def test_a_typed_name_is_used_once(panels: Panels) -> None:
-    writing, key = Writing(panels), view_of_camera().of(StudioView).cameras[0].key
+    writing, key = writing_folder(panels), view_of_camera().of(StudioView).cameras[0].key
     writing.draw(view_of_camera())
     for name, button, why_not in (
         ("", "Rename", "Type a new name"),
@@ -301,17 +299,17 @@ def test_a_typed_name_is_used_once(panels: Panels) -> None:
     ):
         panels.type("New name", name)
         panels.press(button)
-        assert why_not in panels.client.notices[-1] and writing.session.asked == []
+        assert why_not in panels.client.notices[-1] and writing.asked == []
     panels.type("New name", "hand")
     panels.press("Duplicate")
     request = EditRequest("duplicate", key, name="hand")
-    assert writing.session.asked == [EditWanted(request)]
+    assert writing.asked == [EditWanted(request)]
     writing.draw(view_of_camera(edit_state=EditState("planned", replace(request, settings=SETTINGS))))
     assert panels.typed("New name") == "hand"
     writing.draw(view_of_camera(edit_state=EditState("checked", request)))
     assert panels.typed("New name") == ""
     panels.press("Duplicate")
-    assert writing.session.asked[-1] == EditWanted(replace(request, name="base_camera_2"))
+    assert writing.asked[-1] == EditWanted(replace(request, name="base_camera_2"))
 
 
 @given(
@@ -344,24 +342,21 @@ def refusal_of(do: Callable[[], object]) -> str:
 
 
 def test_a_pasted_calibration_is_read_in_the_chosen_convention_and_units(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraExport(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
-    session.shown = view_of_camera()
-    folder.draw(session.shown)
+    folder = Folder(panels, CameraExport)
+    folder.draw(view_of_camera())
     panels.press("Apply to the camera")
-    assert session.asked == [] and "Paste a calibration" in panels.client.notices[-1]
+    assert folder.asked == [] and "Paste a calibration" in panels.client.notices[-1]
     panels.set("Convention", "OpenGL, Blender")
     panels.set("Direction", "camera to world")
     panels.set("Units", "millimetres")
     text = "1 0 0 500\n0 1 0 -60\n0 0 1 700\n0 0 0 1"
     panels.type("Calibration", text)
     panels.press("Apply to the camera")
-    (placed,) = session.asked
+    (placed,) = folder.asked
     assert placed.key == ("sensor", "base_camera")
     assert placed.settings.position == pytest.approx((0.5, -0.06, 0.7))
     assert np.allclose(axes_of(placed.settings.quaternion)[0], (0, 0, -1))
-    folder.draw(session.shown)
+    folder.draw(view_of_camera())
     assert panels.typed("Calibration") == text and "x right, y up" in panels.html()
 
 
@@ -370,16 +365,36 @@ def test_a_pasted_calibration_is_read_in_the_chosen_convention_and_units(panels:
 KEY: CameraKey = ("sensor", "base_camera")
 
 
-def seen(name: str, pixels: list[float], cut: tuple[int, ...] = ()) -> ObjectSeen:
-    counts, count = np.array(pixels, np.float32), len(pixels)
-    whole = np.full(count, max(pixels), np.float32)
-    at_border = np.isin(np.arange(count), cut)
-    return ObjectSeen(name, False, False, np.ones(count, bool), counts, whole, whole, at_border, counts * 0)
+def seen(
+    name: str,
+    pixels: list[float],
+    unhindered: list[float] | None = None,
+    alone: list[float] | None = None,
+    cut: tuple[int, ...] = (),
+    present: list[bool] | None = None,
+    scenery: bool = False,
+    never_drawn: bool = False,
+) -> ObjectSeen:
+    count = len(pixels)
+    unhindered = pixels if unhindered is None else unhindered
+    return ObjectSeen(
+        name=name,
+        never_drawn=never_drawn,
+        scenery=scenery,
+        present=np.array([True] * count if present is None else present),
+        pixels=np.array(pixels, np.float32),
+        unhindered=np.array(unhindered, np.float32),
+        alone=np.array(unhindered if alone is None else alone, np.float32),
+        margin=np.zeros(count, np.float32),
+        cut=np.isin(np.arange(count), cut),
+    )
 
 
 def report_of(
-    *objects: ObjectSeen, envs: tuple[int, ...], counts: dict[int, int] | None = None
+    *objects: ObjectSeen, envs: tuple[int, ...] | None = None, counts: dict[int, int] | None = None
 ) -> CameraReport:
+    """Return a report with the depths of `counts` pixels by bin, in all envs unless given."""
+    envs = tuple(range(len(objects[0].pixels))) if envs is None else envs
     rows = np.zeros((len(envs), len(DEPTH_EDGES_METRES) - 1), np.int64)
     for place, pixels in ({20: 10, 30: 5} if counts is None else counts).items():
         rows[:, place] = pixels
@@ -389,18 +404,71 @@ def report_of(
     return CameraReport(KEY, (128, 128), (64, 64), envs, objects, depth, 7, 100.0)
 
 
+def test_rows_list_the_least_seen_object_first_without_scenery() -> None:
+    report = report_of(
+        seen("bowl", [90, 80, 70, 60]),
+        seen("cube", [0, 50, 40, 30], unhindered=[20, 50, 80, 30], cut=(3,)),
+        seen("table", [999, 999, 999, 999], scenery=True),
+        seen("goal", [0, 0, 0, 0], never_drawn=True),
+    )
+    rows = object_rows(report)
+    assert [row["name"] for row in rows] == ["cube", "bowl", "goal"]
+    assert (rows[0]["seen"], rows[0]["pixels"], rows[0]["share"]) == ("75 %", "35", "0.21 %")
+    assert rows[0]["cut"] == "25 %"
+    assert rows[0]["bad"] == ["seen", "cut", "hidden"] and rows[1]["bad"] == []
+    assert rows[2]["seen"] == "" and "hides" in rows[2]["note"]
+    (half,) = object_rows(
+        report_of(seen("cube", [40, 50, 60], unhindered=[80, 50, 60], present=[True, True, False]))
+    )
+    assert half["bad"] == ["hidden"] and "2 of 3" in half["note"] and half["hidden"] == "25 %"
+    assert half["moods"] == ["good", "good", "none"]
+    (little,) = object_rows(report_of(seen("cube", [90, 50], unhindered=[100, 50], alone=[100, 90])))
+    assert little["bad"] == [] and "behind other objects" in little["note"]
+    (absent,) = object_rows(report_of(seen("cube", [0], present=[False])))
+    assert absent["seen"] == ""
+
+
+@pytest.mark.parametrize(
+    ("thing", "words"),
+    [
+        (seen("cube", [0, 90]), "cube is not visible in 1 of 2 envs."),
+        (
+            seen("cube", [50, 90], cut=(1,)),
+            "Everything is visible; cube is cut by the border in 1 of 2 envs.",
+        ),
+        (seen("cube", [50, 90]), "Everything is visible, and nothing is cut."),
+        (seen("table", [50, 90], scenery=True), "No object is visible in these envs."),
+    ],
+)
+def test_the_headline_names_the_worst_problem(thing: ObjectSeen, words: str) -> None:
+    assert headline(report_of(thing)) == words
+
+
+def test_an_env_is_labelled_with_its_worst_problem() -> None:
+    free = [0.0, 30.0, 80.0, 90.0, 90.0, 20.0, 0.0, 45.0]
+    cube = seen("cube", [0, 0, 40, 90, 90, 20, 0, 45], free, alone=[*free[:6], 50, 90], cut=(3,))
+    report = report_of(cube, seen("bowl", [200] * 8))
+    assert [env_words(report, env) for env in range(8)] == [
+        "no cube",
+        "cube hidden",
+        "cube 50 % hidden",
+        "cube cut",
+        "cube 90 px",
+        "cube 20 px, small",
+        "cube hidden",
+        "cube 50 % behind objects",
+    ]
+
+
 def measured(report: CameraReport, **more: Any) -> StudioResults:
     return StudioResults(report=report, report_of=KEY, report_settings=SETTINGS, **more)
 
 
 def test_a_report_over_steps_sends_the_page_to_each_moment(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraReportPanel(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
+    folder = Folder(panels, CameraReportPanel)
     moments = tuple(MeasuredMoment(serial, 2, step) for serial, step in ((41, 0), (43, 5), (47, 9)))
-    report = report_of(seen("cube", [30, 0, 20], cut=(2,)), envs=(2, 2, 2))
-    session.shown = view_of_camera(results=measured(report, report_moments=moments))
-    folder.draw(session.shown)
+    report = report_of(seen("cube", [30, 0, 20], [30, 30, 30], cut=(2,)), envs=(2, 2, 2))
+    folder.draw(view_of_camera(results=measured(report, report_moments=moments)))
     html = panels.html("wb-seen-table")
     assert re.findall('<i class="wb-step-(\\w+)"[^>]*title="step (\\d+)', html) == [
         ("good", "0"),
@@ -409,29 +477,26 @@ def test_a_report_over_steps_sends_the_page_to_each_moment(panels: Panels) -> No
     ]
     for number, moment in enumerate(moments):
         panels.ask(ShowMeasuredMoment(number=number))
-        assert session.asked[-1] == MomentShown(moment.serial, 2)
+        assert folder.asked[-1] == MomentShown(moment.serial, 2)
     for number in (-1, 3):
         panels.do(ShowMeasuredMoment(number=number))
-    assert len(session.asked) == 3, "there is no such moment"
+    assert len(folder.asked) == 3, "there is no such moment"
 
 
 def test_a_report_offers_the_planes_that_would_fit_and_uses_them(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraReportPanel(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
-    report = report_of(seen("cube", [30.0, 20.0]), envs=(0, 1))
+    folder = Folder(panels, CameraReportPanel)
+    report = report_of(seen("cube", [30.0, 20.0]))
     near, far = report.depth.suggested_near, report.depth.suggested_far
     assert near is not None and far is not None
 
     def shows(camera: CameraSettings = SETTINGS, results: StudioResults | None = None) -> tuple[bool, bool]:
-        session.shown = view_of_camera(camera, results=results or measured(report))
-        folder.draw(session.shown)
+        folder.draw(view_of_camera(camera, results=results or measured(report)))
         return panels.presses(UseSuggestedPlane(plane="near")), panels.presses(UseSuggestedPlane(plane="far"))
 
     assert shows() == (True, True)
     panels.ask(UseSuggestedPlane(plane="near"))
     panels.ask(UseSuggestedPlane(plane="far"))
-    assert session.asked == [
+    assert folder.asked == [
         CameraPlaced(KEY, replace(SETTINGS, near=near)),
         CameraPlaced(KEY, replace(SETTINGS, far=far)),
     ]
@@ -441,13 +506,12 @@ def test_a_report_offers_the_planes_that_would_fit_and_uses_them(panels: Panels)
     shows(results=replace(measured(report), report_of=("human", "render_camera")))
     assert panels.html("wb-seen-table") == "", "it is of another camera"
     panels.do(UseSuggestedPlane(plane="near"))
-    assert len(session.asked) == 2
+    assert len(folder.asked) == 2
 
 
 def test_a_report_has_its_numbers_and_says_when_it_is_old(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraReportPanel(panels.server, cast(Any, session))
-    report = report_of(seen("cube", [30.0, 0.0, 20.0, 10.0]), envs=(0, 1, 2, 3))
+    folder = Folder(panels, CameraReportPanel)
+    report = report_of(seen("cube", [30.0, 0.0, 20.0, 10.0], [30.0] * 4))
 
     def html(**more: Any) -> str:
         folder.draw(view_of_camera(**more))
@@ -507,16 +571,13 @@ def picture(env: int, grey: int = 9, key: Any = KEY) -> Picture:
 
 
 def test_a_sheet_has_each_envs_picture_with_its_finding_and_selects_the_env(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraReportPanel(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
-    report = report_of(seen("cube", [50.0, 0.0]), envs=(3, 1))
+    folder = Folder(panels, CameraReportPanel)
+    report = report_of(seen("cube", [50.0, 0.0], unhindered=[50.0, 50.0]), envs=(3, 1))
     sheet = tuple(picture(env, 80 * env) for env in (1, 3, 2))
 
     def cells(selected: int = 3, **more: Any) -> list[tuple[str, str, str]]:
         view = view_of_camera(**more)
         view = replace(view, settings=replace(view.settings, selected_env=selected))
-        session.shown = view
         folder.draw(view)
         figures = re.findall(
             '<figure (.*?)data-env="(\\d+)"( class="wb-selected")?>.*?<figcaption>(.*?)</figcaption>',
@@ -545,20 +606,16 @@ def test_a_sheet_has_each_envs_picture_with_its_finding_and_selects_the_env(pane
 
 
 def test_a_comparison_is_shown_with_its_differences_until_another_camera_is_chosen(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraCompare(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
+    folder = Folder(panels, CameraCompare)
     moved = replace(SETTINGS, far=50.0)
-    session.shown = view_of_camera(moved)
-    folder.draw(session.shown)
+    folder.draw(view_of_camera(moved))
     assert not panels.shows("Return to A")
     panels.press("Show side by side")
-    assert session.asked == [ComparisonWanted(SETTINGS)]
+    assert folder.asked == [ComparisonWanted(SETTINGS)]
     both = StudioResults(compared=(picture(2, 10), picture(2, 200)))
 
     def html(now: CameraSettings) -> str:
-        session.shown = view_of_camera(now, results=both)
-        folder.draw(session.shown)
+        folder.draw(view_of_camera(now, results=both))
         return panels.html("wb-pair")
 
     text = html(moved)
@@ -585,13 +642,12 @@ def captions(html: str) -> list[str]:
 
 def offer(position: tuple[float, float, float], score: float) -> OfferedPlacement:
     settings = replace(SETTINGS, position=position)
-    report = report_of(seen("cube", [30.0]), envs=(0,))
+    report = report_of(seen("cube", [30.0]))
     return OfferedPlacement(settings, (0, 0, 0), score, "words", report, picture(0))
 
 
 def test_an_offer_can_be_used_unless_the_camera_is_there(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraSuggest(panels.server, cast(Any, session))
+    folder = Folder(panels, CameraSuggest)
     offers = offer((0.1, 0.2, 0.3), 0.75), offer((0.4, 0.5, 0.6), 0.5)
 
     def used(now: CameraSettings, of: Any = KEY) -> list[bool]:
@@ -607,26 +663,16 @@ def test_an_offer_can_be_used_unless_the_camera_is_there(panels: Panels) -> None
 
 
 def test_the_search_box_is_drawn_around_the_eye_in_the_frame_of_the_mount(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraSuggest(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
+    folder = Folder(panels, CameraSuggest)
     offset = np.array([10.0, -3.0, 0.0], np.float32)
     half = math.sqrt(0.5)
     mount = make_pose((0.5, 0.2, 0.4), (half, 0, 0, half)).astype(np.float32)  # turned to the left about z
 
     def corners(one: StudioCamera) -> list[list[float]]:
-        session.shown = running(1, studio=StudioView(cameras=(one,), selected=one.key))
-        folder.draw_in_view(session.shown, offset)
-        nodes = panels.nodes("/bounds of the eye")
-        return (
-            [
-                [*edges.min(axis=0), *edges.max(axis=0)]
-                for (node,) in [nodes]
-                for edges in [node.points.reshape(-1, 3)]
-            ]
-            if nodes
-            else []
-        )
+        view = running(1, studio=StudioView(cameras=(one,), selected=one.key))
+        folder.part.draw_in_view(view, offset)
+        boxes = [node.points.reshape(-1, 3) for node in panels.nodes("/bounds of the eye")]
+        return [[*edges.min(axis=0), *edges.max(axis=0)] for edges in boxes]
 
     assert corners(camera()) == []
     panels.do(ShowSearchBox(on=True))
@@ -644,17 +690,14 @@ def test_the_search_box_is_drawn_around_the_eye_in_the_frame_of_the_mount(panels
 
 
 def test_few_links_of_the_robot_are_offered_until_all_are_wanted(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraSuggest(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
+    folder = Folder(panels, CameraSuggest)
     links = tuple(f"arm/l{number}" for number in range(7))
     objects = ObjectToSee("cube", False), ObjectToSee("arm", False, links, robot=True)
 
     def offered() -> dict[str, bool]:
         view = view_of_camera()
         assert view.task is not None
-        session.shown = replace(view, task=replace(view.task, objects=objects))
-        folder.draw(session.shown)
+        folder.draw(replace(view, task=replace(view.task, objects=objects)))
         pills = re.findall('aria-checked="(true|false)" title="([^"]+)"', panels.html("wb-objects"))
         return {name: on == "true" for on, name in pills}
 
@@ -665,7 +708,7 @@ def test_few_links_of_the_robot_are_offered_until_all_are_wanted(panels: Panels)
     panels.ask(ToggleAllLinks())
     assert offered() == {"cube": True, **dict.fromkeys(links[:4], False), "arm/l6": True}
     panels.press("Search")
-    assert session.asked[-1].objects == ("cube", "arm/l6") and session.asked[-1].seeds == 8
+    assert folder.asked[-1].objects == ("cube", "arm/l6") and folder.asked[-1].seeds == 8
     objects = ObjectToSee("cube", False), ObjectToSee("goal", True)
     assert offered() == {"cube": True}, "a sensor does not see the goal"
     people = replace(camera(), key=("human", "people"))
@@ -691,14 +734,11 @@ class Downloads:
 
 
 def test_one_camera_or_all_are_downloaded_in_the_chosen_form(panels: Panels) -> None:
-    session, client = StubSession(), Downloads()
+    folder, client = Folder(panels, CameraExport), Downloads()
     panels.visitor.client = client  # type: ignore[assignment]
-    folder = CameraExport(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
     one, unknown = camera(), replace(camera(), key=("human", "people"), now=None)
     other = replace(one, key=("human", "people"), now=replace(SETTINGS, far=5.0))
-    session.shown = running(1, studio=StudioView(cameras=(one, other), selected=one.key))
-    folder.draw(session.shown)
+    folder.draw(running(1, studio=StudioView(cameras=(one, other), selected=one.key)))
     panels.press("Download")
     panels.set("Of", "all cameras")
     panels.set("File", "OpenCV YAML")
@@ -707,20 +747,17 @@ def test_one_camera_or_all_are_downloaded_in_the_chosen_form(panels: Panels) -> 
         ("base_camera.json", calibration_text([one], "json")),
         ("cameras_opencv.yaml", calibration_text([one, other], "opencv")),
     ]
-    session.shown = running(1, studio=StudioView(cameras=(one, unknown), selected=one.key))
+    folder.session.shown = running(1, studio=StudioView(cameras=(one, unknown), selected=one.key))
     panels.press("Download")
     assert len(client.files) == 2 and panels.client.notices
 
 
 def test_the_matrices_follow_camera_mount_convention_and_direction(panels: Panels) -> None:
-    session = StubSession()
-    folder = CameraExport(panels.server, cast(Any, session))
-    panels.visitors.do = folder.do
+    folder = Folder(panels, CameraExport)
     mount = make_pose((0.5, 0.2, 0.4), (0.6, 0, 0, 0.8)).astype(np.float32)
 
     def extrinsic(one: StudioCamera) -> np.ndarray:
-        session.shown = running(1, studio=StudioView(cameras=(one,), selected=one.key))
-        folder.draw(session.shown)
+        folder.draw(running(1, studio=StudioView(cameras=(one,), selected=one.key)))
         first, second = re.findall('data-copy="([^"]+)"', panels.html("wb-matrix"))
         np.testing.assert_allclose(json.loads(second), intrinsic_of(one.now or SETTINGS), rtol=1e-8)
         return np.array(json.loads(first))
@@ -746,7 +783,7 @@ def test_the_matrices_follow_camera_mount_convention_and_direction(panels: Panel
 
 
 def test_each_request_for_a_change_names_the_chosen_camera(panels: Panels) -> None:
-    writing = Writing(panels)
+    writing = writing_folder(panels)
     moved = replace(SETTINGS, far=50.0)
     writing.draw(view_of_camera(moved))
     (one,) = view_of_camera(moved).of(StudioView).cameras
@@ -755,7 +792,7 @@ def test_each_request_for_a_change_names_the_chosen_camera(panels: Panels) -> No
     panels.press("Remove")
     panels.type("New name", "wrist")
     panels.press("Rename")
-    assert writing.session.asked == [
+    assert writing.asked == [
         EditWanted(EditRequest("edit", KEY)),
         EditWanted(EditRequest("remove", KEY)),
         EditWanted(EditRequest("rename", KEY, name="wrist")),
@@ -766,12 +803,12 @@ def test_each_request_for_a_change_names_the_chosen_camera(panels: Panels) -> No
     writing.draw(running(1))
     for command in (PlanCameraChange(), RemoveCamera()):
         panels.do(command)
-    assert len(writing.session.asked) == 3 and len(panels.client.notices) == 3
+    assert len(writing.asked) == 3 and len(panels.client.notices) == 3
     assert not panels.shows("Remove") and panels.shows("Add sensor")
 
 
 def test_an_added_sensor_looks_at_the_objects_with_the_lens_of_its_siblings(panels: Panels) -> None:
-    writing = Writing(panels)
+    writing = writing_folder(panels)
     (one,) = view_of_camera().of(StudioView).cameras
     mounted = replace(
         one,
@@ -787,16 +824,15 @@ def test_an_added_sensor_looks_at_the_objects_with_the_lens_of_its_siblings(pane
     ):
         writing.draw(view_of_camera(cameras=cameras, selected=None))
         panels.do(command)
-        request = writing.session.asked[-1].request
+        request = writing.asked[-1].request
         assert (request.what, request.key) == ("add", (command.kind, name))
         assert replace(request.settings, position=like.position, quaternion=like.quaternion) == like
     panels.type("New name", "top")
     panels.do(AddCamera(kind="sensor"))
-    assert writing.session.asked[-1].request.key == ("sensor", "top")
+    assert writing.asked[-1].request.key == ("sensor", "top")
 
 
 def test_an_added_camera_looks_at_the_middle_of_the_objects_in_all_envs(panels: Panels) -> None:
-    writing = Writing(panels)
     view = running(3)
     assert view.task is not None and view.step is not None
     poses = view.step.poses.copy()
@@ -812,17 +848,11 @@ def test_an_added_camera_looks_at_the_middle_of_the_objects_in_all_envs(panels: 
         ((-2.0, 5.0, 0.0), (1, 0, 0, 0), 4.0),
         ((2.5, 0.1, 0.0), (1, 0, 0, 0), None),
     ):
-        part = WriteToFile(
-            panels.server,
-            cast(Any, writing.session),
-            lambda _, lens, position=position, forward=forward: replace(
-                lens, position=position, quaternion=forward
-            ),
-            panels.server.gui.add_folder(None),
-        )
-        writing.session.shown = view
-        part.do(AddCamera(kind="human"), panels.visitor)
-        request = writing.session.asked[-1].request
+        there = {"position": position, "quaternion": forward}
+        writing = writing_folder(panels, lambda _, lens, there=there: replace(lens, **there))
+        writing.draw(view)
+        panels.do(AddCamera(kind="human"))
+        request = writing.asked[-1].request
         assert request.settings.position == position and request.settings.distance == (
             None if distance is None else pytest.approx(distance)
         )
@@ -844,7 +874,7 @@ def test_an_added_camera_looks_at_the_middle_of_the_objects_in_all_envs(panels: 
 def test_a_change_offers_what_can_be_done_with_it_and_shows_its_diff(
     panels: Panels, stage: Any, what: Any, offered: set[Command]
 ) -> None:
-    writing = Writing(panels)
+    writing = writing_folder(panels)
     edit = SourceEdit(
         "/home/me/push.py", "    a = 1\n    b = 2\n", "    a = 1\n    b = 3\n", ("a note",), SETTINGS
     )
@@ -865,7 +895,7 @@ def test_a_change_offers_what_can_be_done_with_it_and_shows_its_diff(
 
 
 def test_a_planned_camera_shows_its_picture_and_a_stale_plan_is_planned_again(panels: Panels) -> None:
-    writing = Writing(panels)
+    writing = writing_folder(panels)
     request = EditRequest("add", ("sensor", "new"), SETTINGS, about="From there.")
     state = EditState("planned", request, drawing=True)
     writing.draw(view_of_camera(edit_state=state))
@@ -879,4 +909,4 @@ def test_a_planned_camera_shows_its_picture_and_a_stale_plan_is_planned_again(pa
     planned = EditState("planned", EditRequest("edit", KEY, SETTINGS))
     writing.draw(view_of_camera(cameras=(replace(one, moved=True),), edit_state=planned))
     panels.press("Show the change")
-    assert writing.session.asked == [EditWanted(EditRequest("edit", KEY))]
+    assert writing.asked == [EditWanted(EditRequest("edit", KEY))]
