@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from tests.cameras.studio_runs import MOVED, SETTINGS, runs
 from tests.drive.session import BASE
 from tests.drive.waiting import until
+from workbench.cameras import edit_jobs
 from workbench.cameras import events as of
 from workbench.cameras.apply import StudioJobs
 from workbench.cameras.questions import DrawCamera, MeasureCamera, SuggestCameras
@@ -305,6 +307,19 @@ def test_a_change_is_written_reverted_and_refused_in_a_file_that_was_edited_sinc
     file.write_text("edited")
     for revert in (False, True):
         assert isinstance(changes(revert), of.FileNotChanged) and file.read_text() == "edited"
+
+
+def test_the_session_goes_on_while_a_change_waits_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk, waiting, resume = Desk(), threading.Event(), threading.Event()
+    monkeypatch.setattr(edit_jobs, "apply", lambda edit: (waiting.set(), resume.wait(60)))
+    do(lambda: desk.jobs.perform(of.ChangeFile(SourceEdit("push.py", "old", "new", (), None), False)))
+    assert waiting.wait(60)
+    try:
+        do(lambda: None)
+        assert desk.happened == []
+    finally:
+        resume.set()
+    until(lambda: desk.happened == [of.FileChanged()], "the end of the edit")
 
 
 def test_a_plan_needs_the_hooks_of_the_running_version_and_none_begins_while_closing(tmp_path: Path) -> None:

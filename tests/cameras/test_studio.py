@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import BASE, camera, in_studio, moved, start_over, step, wait_until
+from tests.drive.session import BASE, camera, in_studio, moved, save, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.cameras.commands import (
     CopyTask,
@@ -42,6 +42,18 @@ from workbench.live.view import SessionView
 from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
+
+
+LIMITED = """
+
+def limited(configs):
+    for config in configs:
+        if config.fov < 0.1:
+            raise ValueError("no lens at all")
+        config.fov = max(config.fov, 0.3)
+    return configs
+"""
+CALL = 'return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
 
 
 @dataclass
@@ -129,18 +141,8 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
     return reached
 
 
-def test_invalid_placements_are_refused_with_a_reason_and_change_nothing(session: Session) -> None:
-    start = camera(session, BASE).now
-    session.happen(CameraPlaced(BASE, replace(start, near=5.0, far=1.0)))
-    view = wait_until(session, in_studio(lambda s: "near must be" in s.problem), "the reason")
-    assert not moved(view)
-    session.happen(CameraPlaced(BASE, replace(start, shader_pack="nonsense")))
-    view = wait_until(
-        session, in_studio(lambda s: "there is no shader pack" in s.problem), "the worker's reason"
-    )
-    assert not moved(view)
-    session.happen(CameraPlaced(("sensor", "nobody"), start))
-    wait_until(session, in_studio(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
+def reached(session: Session, what: Callable[[StudioView], object], name: str) -> StudioView:
+    return wait_until(session, in_studio(what), name).of(StudioView)
 
 
 def test_a_placement_is_written_compared_and_reverted(session: Session, task_file: Path) -> None:
@@ -150,71 +152,53 @@ def test_a_placement_is_written_compared_and_reverted(session: Session, task_fil
     start = camera(session, BASE).now
     session.happen(CameraPlaced(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
-    view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
-    assert view.of(StudioView).edit_state.stage == "planned", view.of(StudioView).edit_state.message
-    assert task_file.read_bytes() == before and "+" in view.of(StudioView).edit_state.edit.diff
+    state = reached(session, lambda s: s.edit_state.stage in ("planned", "refused"), "the plan").edit_state
+    assert state.stage == "planned", state.message
+    assert task_file.read_bytes() == before and "+" in state.edit.diff
     session.do(SaveCameraChange())
-    view = wait_until(
-        session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
-    )
-    assert view.of(StudioView).edit_state.stage == "checked", view.of(StudioView).edit_state.message
-    assert view.reload.level == "cameras" and not moved(view)
+    state = reached(session, lambda s: s.edit_state.stage in ("checked", "mismatch"), "the check").edit_state
+    assert state.stage == "checked", state.message
+    assert session.view().reload.level == "cameras" and not moved(session.view())
     now = camera(session, BASE)
-    assert now.now == now.info.settings and not differences(
-        now.now, view.of(StudioView).edit_state.edit.settings
-    )
-    assert task_file.read_bytes() == view.of(StudioView).edit_state.edit.new_text.encode()
+    assert now.now == now.info.settings and not differences(now.now, state.edit.settings)
+    assert task_file.read_bytes() == state.edit.new_text.encode()
     session.do(RevertCameraChange())
-    view = wait_until(
-        session,
-        in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
-        "the original file",
+    studio = reached(
+        session, lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading, "the original file"
     )
     assert task_file.read_bytes() == before
     task_file.write_bytes(saved)
     # The revert also resets the placement, and one step of undo restores it.
-    assert (
-        not moved(view)
-        and view.of(StudioView).camera(BASE).now == view.of(StudioView).camera(BASE).info.settings == start
-    )
-    assert view.of(StudioView).edit_state.message.endswith(
-        "base_camera is where the file places it; Undo restores your placement."
-    )
+    assert not moved(session.view()) and studio.camera(BASE).now == studio.camera(BASE).info.settings == start
     wait_until(session, seen_from(BASE, start), "the camera where the file places it")
-    assert view.of(StudioView).undo == "reverted the change of base_camera"
+    assert session.view().of(StudioView).undo == "reverted the change of base_camera"
     session.do(UndoCamera())
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.of(StudioView).camera(BASE).now, now.now)
 
 
-def test_a_camera_removed_from_the_file_returns_at_its_placement(session: Session, task_file: Path) -> None:
-    before = task_file.read_text()
-    there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
-    session.happen(CameraPlaced(BASE, there))
-    session.happen(EditWanted(EditRequest("remove", BASE)))
-    view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
-    assert view.of(StudioView).edit_state.stage == "planned", view.of(StudioView).edit_state.message
-    session.do(SaveCameraChange())
-    wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the version without it")
-    session.do(RevertCameraChange())
-    wait_until(
-        session,
-        in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
-        "the original file",
-    )
-    assert task_file.read_text() == before
-    assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
-    wait_until(session, seen_from(BASE, there), "the camera where it was placed")
-    session.do(DropCameraChange())
+def test_a_change_that_the_hook_overrides_is_refused_before_it_is_written(
+    session: Session, task_file: Path
+) -> None:
+    saved, now = task_file.read_text(), camera(session, BASE).now
+    assert CALL in saved
+    limiting = saved.replace(CALL, CALL.replace("return ", "return limited(") + ")") + LIMITED
+    save(session, task_file, limiting)
+    for fov, why in ((0.2, "does not give the camera the requested settings"), (0.05, "no lens at all")):
+        session.happen(CameraPlaced(BASE, replace(now, fov=fov)))
+        session.happen(EditWanted(EditRequest("edit", BASE)))
+        state = reached(session, lambda s: s.edit_state.stage == "refused", "the refusal").edit_state
+        assert why in state.message and f"fov={fov}" in state.snippet
+        assert task_file.read_text() == limiting and camera(session, BASE).info.settings == now
+        session.do(DropCameraChange())
+    save(session, task_file, saved)
 
 
-def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
-    """Wait until the studio's background work is done and `reached` holds; return the studio."""
-    view = wait_until(
-        session, in_studio(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what
-    )
-    assert not view.of(StudioView).problem, view.of(StudioView).problem
-    return view.of(StudioView)
+def settled(session: Session, ready: Callable[[StudioView], object], what: str) -> StudioView:
+    """Wait until the studio's background work is done and `ready` holds; return the studio."""
+    studio = reached(session, lambda s: s.progress is None and (ready(s) or s.problem), what)
+    assert not studio.problem, studio.problem
+    return studio
 
 
 def test_a_camera_is_measured_in_all_envs_and_its_report_is_stale_after_a_move(session: Session) -> None:
@@ -300,37 +284,28 @@ def test_measuring_seeds_and_searching_run_in_a_separate_process(session: Sessio
     session.do(UsePlacement(number=0))
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
     session.happen(MeasureWanted("resets", 500))
-    wait_until(
-        session,
-        in_studio(lambda s: s.results.measuring and s.results.report is not None),
-        "what is known, as from before",
-    )
-    wait_until(
-        session, in_studio(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
-    )
+    reached(session, lambda s: s.results.measuring and s.results.report, "what is known, as from before")
+    reached(session, lambda s: s.progress is not None and s.progress.total == 500, "a long judgement")
     session.do(StopMeasuring())
-    wait_until(session, in_studio(lambda s: s.progress is None and not s.results.measuring), "its end")
+    reached(session, lambda s: s.progress is None and not s.results.measuring, "its end")
     session.happen(SuggestionsWanted(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1))
-    wait_until(session, in_studio(lambda s: "'nothing' is not an object" in s.problem), "why not")
+    reached(session, lambda s: "'nothing' is not an object" in s.problem, "why not")
 
 
 def test_an_installed_task_is_copied_and_the_placement_planned_in_the_copy(
     opened: tuple[Session, Copied],
 ) -> None:
     _, copied = opened
-    view = copied.refused
-    assert (
-        view.of(StudioView).edit_state.can_copy and "is installed" in view.of(StudioView).edit_state.message
+    refused, planned, ended = (
+        view.of(StudioView).edit_state for view in (copied.refused, copied.planned, copied.ended)
     )
+    assert refused.can_copy and "is installed" in refused.message
     view, file = copied.planned, copied.folder / "push_cube_2.py"
-    assert view.task.file == str(file) == view.of(StudioView).edit_state.edit.file
+    assert view.task.file == str(file) == planned.edit.file
     assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
     assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
-    assert view.of(StudioView).edit_state.message.startswith(
-        f"This is your copy of the task, {file}. This changes"
-    )
+    assert planned.message.startswith(f"This is your copy of the task, {file}. This changes")
     assert moved(view) == {BASE}, "the placement must be kept"
     assert copied.named.startswith(str(file)), "the command line must name the copy"
-    view = copied.ended
-    assert view.of(StudioView).edit_state.stage == "checked", view.of(StudioView).edit_state.message
+    assert ended.stage == "checked", ended.message
     assert (copied.folder / "push_cube.py").read_text() == "somebody's own"
