@@ -8,12 +8,14 @@ import tempfile
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from tests.drive.scenes import camera as scene_camera
 from tests.drive.session import BASE, PEOPLE, fake_worker_session
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings
-from workbench.live.events import MomentShown
+from workbench.live.events import MomentShown, VersionLoaded
+from workbench.live.messages import Loaded
 from workbench.live.run import Run
 
 FILE = "/home/me/push.py"
@@ -51,3 +53,10 @@ def version(text: str, *cameras: CameraInfo, run: Run | None = None, **changes: 
     run = runs()[0] if run is None else run
     assert run.task is not None
     return replace(run, task=replace(run.task, source={FILE: text}, cameras=cameras or CAMERAS, **changes))
+
+
+def loaded(level: str | None = "cameras") -> VersionLoaded:
+    """Return a load event; the studio reads only its level, since the run holds the loaded task."""
+    report: Any = None if level is None else SimpleNamespace(level=level)
+    nothing: Any = None
+    return VersionLoaded(Loaded(nothing, nothing, {}, report), on_disk=True)

@@ -27,6 +27,8 @@ from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.view import SessionView
 
+AT = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+INFO = replace(camera("base_camera"), settings=AT)
 BASE, PEOPLE = "base_camera · sensor", "base_camera · human view"
 
 
@@ -34,6 +36,11 @@ def studio(selected: CameraKey | None) -> SessionView:
     infos = camera("base_camera"), replace(camera("base_camera"), kind="human")
     cameras = tuple(StudioCamera(one.key, one, None, False, None) for one in infos)
     return running(1, studio=StudioView(cameras=cameras, selected=selected))
+
+
+def placed(moved: bool = False, **studio: Any) -> SessionView:
+    one = StudioCamera(INFO.key, INFO, replace(AT, width=80) if moved else AT, moved, None)
+    return running(1, studio=StudioView(cameras=(one,), selected=INFO.key, **studio))
 
 
 def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
@@ -56,13 +63,10 @@ def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
 
 
 def test_undo_redo_and_reset_are_offered_when_there_is_something_to_do(live_page: Live) -> None:
-    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
-    info = replace(camera("base_camera"), settings=at)
     tab = live_page.part(TAB)
 
     def offered(moved: bool = False, **changes: Any) -> dict[str, bool]:
-        one = StudioCamera(info.key, info, replace(at, width=80) if moved else at, moved, None)
-        live_page.show(running(1, studio=StudioView(cameras=(one,), selected=info.key, **changes)))
+        live_page.show(placed(moved, **changes))
         buttons = {one.text.strip(): one for one in tab.buttons()}
         return {name: buttons[name].command is not None for name in ("Undo", "Redo", "Reset to file")}
 
@@ -78,15 +82,11 @@ def test_undo_redo_and_reset_are_offered_when_there_is_something_to_do(live_page
 
 
 def test_how_long_the_picture_took_is_shown_unless_it_is_a_preview(live_page: Live) -> None:
-    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
-    info = replace(camera("base_camera"), settings=at)
     tab, pose = live_page.part(TAB), np.array([1, 2, 3, 1, 0, 0, 0], np.float32)
 
     def took(degree: Any = "fast", scale: float = 1.0, **more: Any) -> str:
-        one = StudioCamera(info.key, info, at, False, None)
-        picture = Picture(info.name, info.kind, 0, pose, np.zeros((6, 8, 3), np.uint8), degree=degree)
-        studio = StudioView(cameras=(one,), selected=info.key, preview_scale=scale)
-        live_page.show(running(1, studio=studio, pictures={info.key: picture}, **more))
+        picture = Picture(INFO.name, INFO.kind, 0, pose, np.zeros((6, 8, 3), np.uint8), degree=degree)
+        live_page.show(replace(placed(preview_scale=scale), pictures={INFO.key: picture}, **more))
         return "".join(re.findall('wb-took">(.*?)<', tab.html("wb-took")))
 
     assert took(picture_milliseconds=12.4) == "fast, 12 ms"
@@ -95,13 +95,10 @@ def test_how_long_the_picture_took_is_shown_unless_it_is_a_preview(live_page: Li
 
 
 def test_the_buttons_show_what_is_chosen(live_page: Live) -> None:
-    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
-    info = replace(camera("base_camera"), settings=at)
     tab = live_page.part(TAB)
 
     def on(scale: float = 1.0) -> set[str]:
-        one = StudioCamera(info.key, info, at, False, None)
-        live_page.show(running(1, studio=StudioView(cameras=(one,), selected=info.key, preview_scale=scale)))
+        live_page.show(placed(preview_scale=scale))
         return {one.text.strip() for one in tab.buttons() if one.pressed}
 
     assert on() == {"rgb", "pose", "world", "none", "full"}
@@ -114,26 +111,18 @@ def test_the_buttons_show_what_is_chosen(live_page: Live) -> None:
 
 def test_axes_are_offered_for_the_handles_of_the_pose_only(live_page: Live) -> None:
     """The handles at eye and target have the axes of the world."""
-    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
-    info = replace(camera("base_camera"), settings=at)
-    view = running(
-        1, studio=StudioView(cameras=(StudioCamera(info.key, info, at, False, None),), selected=info.key)
-    )
     tab = live_page.part(TAB)
     for look_at in (False, True, False):
         live_page.do(ChooseHandles(look_at=look_at))
-        live_page.show(view)
+        live_page.show(placed())
         offered = [tab.presses(ChooseAxes(own=own)) for own in (False, True)]
         assert any(offered) == (not look_at)
 
 
 def test_the_frustum_is_hidden_while_a_page_looks_from_the_cameras_place(live_page: Live) -> None:
-    at = CameraSettings((1.0, 2.0, 3.0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
-    info = replace(camera("base_camera"), settings=at)
-    placed = StudioView(cameras=(StudioCamera(info.key, info, at, False, None),), selected=info.key)
-    view = running(1, studio=placed)
+    view = placed()
     assert view.task is not None
-    view = replace(view, task=replace(view.task, cameras=(info,)))
+    view = replace(view, task=replace(view.task, cameras=(INFO,)))
     live_page.show(view)
     assert [node.name for node in live_page.nodes("/cameras/")] == ["/cameras/sensor base_camera"]
     address, arguments = handshake(f"http://127.0.0.1:{live_page.server.get_port()}")

@@ -12,7 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.cameras.studio_runs import CAMERAS, FILE, HAND, MOVED, PAST_ENV, SETTINGS, info, runs, version
+from tests.cameras.studio_runs import (
+    CAMERAS,
+    FILE,
+    HAND,
+    MOVED,
+    PAST_ENV,
+    SETTINGS,
+    info,
+    loaded,
+    runs,
+    version,
+)
 from tests.drive.scenes import problem
 from tests.drive.session import BASE, DEATH, PEOPLE
 from workbench.cameras import events as of
@@ -36,17 +47,11 @@ from workbench.cameras.state import Studio, first_studio, kept_placements, view_
 from workbench.cameras.view import EditKind, EditRequest, EditState, PickedPixel, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.effects import Asked
-from workbench.live.events import FileSaved, Now, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import Loaded, PlaceCamera, TaskFailed
+from workbench.live.events import FileSaved, Now, Send, WorkerDied
+from workbench.live.messages import PlaceCamera, TaskFailed
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
 from workbench.task.write_edits import SourceEdit
-
-
-def loaded(level: str | None = "cameras") -> VersionLoaded:
-    nothing: Any = None
-    report: Any = None if level is None else SimpleNamespace(level=level)
-    return VersionLoaded(Loaded(nothing, nothing, {}, report), on_disk=True)
 
 
 @dataclass
@@ -614,6 +619,10 @@ def test_a_planned_change_is_saved_only_while_the_camera_is_where_it_was(desk: D
     desk.happens(of.CameraPlaced(BASE, MOVED))
     with pytest.raises(Refused):
         desk.happens(SaveCameraChange())
+    desk.happens(of.CameraPlaced(BASE, SETTINGS))
+    assert only(desk.happens(SaveCameraChange()), of.ChangeFile), "it is back"
+    desk.happens(of.FileNotChanged("it is read-only"))
+    desk.happens(of.CameraPlaced(BASE, MOVED))
     plans(desk, EditRequest("add", BASE, SETTINGS), edit_to("new"))
     assert only(desk.happens(SaveCameraChange()), of.ChangeFile), "an added camera was not anywhere"
 

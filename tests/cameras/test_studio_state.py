@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.cameras.studio_runs import FILE, loaded
 from tests.drive.scenes import camera as scene_camera
 from tests.drive.scenes import problem
 from tests.drive.session import BASE, DEATH, PEOPLE, FakeWorkerSession, fake_worker_session
@@ -43,12 +44,11 @@ from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.commands import Step
 from workbench.live.effects import Asked
 from workbench.live.events import FileSaved, MomentShown, Now, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import Loaded, PlaceCamera, Placed, TaskFailed
+from workbench.live.messages import PlaceCamera, Placed, TaskFailed
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
 from workbench.task.write_edits import SourceEdit
 
-FILE = "/home/me/push.py"
 SETTINGS = CameraSettings((0.4, 0.0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
 EDIT = SourceEdit(FILE, "old", "new", (), SETTINGS)
 NOTHING: CameraKey = ("sensor", "nothing")
@@ -84,13 +84,6 @@ def runs() -> tuple[Run, ...]:
         fake.load("rebuilt", cameras=())
         note(fake)
     return tuple(found)
-
-
-def loaded(level: str | None) -> VersionLoaded:
-    """Return a load event; the studio reads only its level, since the run holds the loaded task."""
-    report: Any = None if level is None else SimpleNamespace(level=level)
-    nothing: Any = None
-    return VersionLoaded(Loaded(nothing, nothing, {}, report), on_disk=True)
 
 
 def requests(keys: st.SearchStrategy[CameraKey]) -> st.SearchStrategy[EditRequest]:
@@ -232,26 +225,6 @@ def test_every_step_can_be_undone_until_none_is_left(happened: list[Happens]) ->
         assert effects == [Send(PlaceCamera(step.key, studio.placements.placed.get(step.key)))]
     with pytest.raises(Refused):
         apply(studio, Asked(UndoCamera()), run, now)
-
-
-@given(settings.filter(lambda one: one != SETTINGS), st.booleans())
-def test_only_the_shown_change_can_be_saved(moved: CameraSettings, back: bool) -> None:
-    run, now = runs()[1], Now(0.0, 0.0)
-    request = EditRequest("edit", BASE, SETTINGS)
-    steps = [
-        Asked(SaveCameraChange()),
-        loaded(None),
-        of.EditWanted(request),
-        of.PlanFound(request, EditState("planned", request, EDIT)),
-        of.CameraPlaced(BASE, moved),
-        *([Asked(PutMovedCamerasBack())] if back else []),
-    ]
-    studio = after([(event, 1, 0.0) for event in steps], ignore)
-    if studio.placements.now(BASE) == SETTINGS:
-        assert apply(studio, Asked(SaveCameraChange()), run, now)[1][-1] == of.ChangeFile(EDIT, revert=False)
-    else:
-        with pytest.raises(Refused):
-            apply(studio, Asked(SaveCameraChange()), run, now)
 
 
 @pytest.mark.parametrize("file", [Path("copy.py"), None])

@@ -50,16 +50,10 @@ def assert_same_pose(a: Any, b: Any, atol: float = 1e-9) -> None:
     assert abs(float(np.dot(a[3:], b[3:]))) == pytest.approx(1, abs=1e-7)
 
 
-@pytest.mark.thorough
-def test_json_holds_every_number_and_survives_a_round_trip() -> None:
+def test_json_survives_a_round_trip_and_explains_keys_that_it_has() -> None:
     text = cameras_as_json([FIXED, MOUNTED])
     exported = json.loads(text)
-    first, second = exported["cameras"]
-    assert_allclose(first["intrinsic"], frames.intrinsic_from_fov(0.9, 320, 240))
-    assert_allclose(first["extrinsic_opencv"], frames.opencv_extrinsic(POSE))
-    assert_allclose(second["model_matrix_opengl"], frames.opengl_model_matrix(MOUNTED.pose_in_env))
-    assert (second["mount"], second["position_in_mount"]) == ("panda/panda_hand", [0.1, 0, 0])
-    assert set(exported["conventions"]) <= {"length", "fov"} | set(first), "every explained key must exist"
+    assert set(exported["conventions"]) <= {"length", "fov"} | set(exported["cameras"][0])
     assert len(text.splitlines()) < 80, "a matrix row must be one line"
     for found, camera in zip(find_poses(text), (FIXED, MOUNTED), strict=True):
         assert_same_pose(camera_pose(found), camera.pose_in_env)
@@ -82,6 +76,7 @@ def test_every_number_of_the_json_is_that_of_its_camera() -> None:
         assert_allclose(found["extrinsic_opencv"], frames.opencv_extrinsic(pose))
         assert_allclose(found["model_matrix_opengl"], frames.opengl_model_matrix(pose))
         mounted = camera.mount is not None
+        assert found["mount"] == camera.mount
         assert (found["position_in_mount"] == [*s.position]) is mounted
         assert (found["quaternion_in_mount"] == [*s.quaternion]) is mounted
     with pytest.raises(ValueError, match="panda/panda_hand"):
