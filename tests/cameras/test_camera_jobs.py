@@ -95,11 +95,19 @@ class Desk:
         if (now := self.jobs.progress) is not None:
             self.progress.append((now.what, now.done, now.total))
 
+    def event(self, effect: Any) -> Any:
+        """The only event that the effect leads to."""
+        do(lambda: self.jobs.perform(effect))
+        until(lambda: self.happened, "the event")
+        (event,) = self.happened
+        self.happened.clear()
+        return event
+
     def performs(self, effect: Any) -> list[Any]:
         """What happens until the job has ended."""
         do(lambda: self.jobs.perform(effect))
         until(lambda: do(lambda: self.jobs.progress) is None, "the end of the job")
-        happened, self.happened = self.happened[:], self.happened
+        happened = self.happened[:]
         self.happened.clear()
         return happened
 
@@ -257,13 +265,9 @@ def test_a_probed_pixel_is_the_one_under_the_pointer_and_its_point_is_where_it_w
 def test_a_preview_and_a_new_cameras_picture_are_asked_of_the_worker_that_plays() -> None:
     desk = Desk()
     question = DrawCamera(BASE, SETTINGS, 2, scale=0.5)
-    do(lambda: desk.jobs.perform(of.DrawPreview(question)))
-    until(lambda: desk.happened, "the preview")
-    assert desk.live.asked == [question] and desk.happened.pop().picture.env == 2
+    assert desk.event(of.DrawPreview(question)).picture.env == 2 and desk.live.asked == [question]
     request = EditRequest("add", BASE, SETTINGS)
-    do(lambda: desk.jobs.perform(of.DrawNewCamera(request, question)))
-    until(lambda: desk.happened, "the picture")
-    drawn = desk.happened.pop()
+    drawn = desk.event(of.DrawNewCamera(request, question))
     assert drawn.request == request and drawn.picture.env == 2
     desk.live.fails_at = len(desk.live.asked)
     do(lambda: desk.jobs.perform(of.DrawNewCamera(request, question)))
@@ -296,17 +300,15 @@ def test_a_change_is_written_reverted_and_refused_in_a_file_that_was_edited_sinc
     file.write_text("old")
     edit = SourceEdit(str(file), "old", "new", (), SETTINGS)
 
-    def changes(revert: bool) -> Any:
-        do(lambda: desk.jobs.perform(of.ChangeFile(edit, revert)))
-        until(lambda: desk.happened, "the end of the edit")
-        return desk.happened.pop()
-
     for _ in range(2):
-        assert changes(revert=False) == of.FileChanged() and file.read_text() == "new"
-        assert changes(revert=True) == of.FileChanged() and file.read_text() == "old"
+        assert desk.event(of.ChangeFile(edit, False)) == of.FileChanged() and file.read_text() == "new"
+        assert desk.event(of.ChangeFile(edit, True)) == of.FileChanged() and file.read_text() == "old"
     file.write_text("edited")
     for revert in (False, True):
-        assert isinstance(changes(revert), of.FileNotChanged) and file.read_text() == "edited"
+        assert (
+            isinstance(desk.event(of.ChangeFile(edit, revert)), of.FileNotChanged)
+            and file.read_text() == "edited"
+        )
 
 
 def test_the_session_goes_on_while_a_change_waits_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -331,9 +333,7 @@ def test_a_plan_needs_the_hooks_of_the_running_version_and_none_begins_while_clo
     desk = Desk(Asker(fails_at=0))
 
     def found(load: Load | None) -> EditState:
-        do(lambda: desk.jobs.perform(of.FindPlan(request, task, None, load)))
-        until(lambda: desk.happened, "the plan")
-        event = desk.happened.pop()
+        event = desk.event(of.FindPlan(request, task, None, load))
         assert isinstance(event, of.PlanFound) and event.request == request
         return event.state
 
@@ -349,10 +349,6 @@ def test_a_bug_in_an_edit_is_told_and_the_copy_of_a_task_is_opened(tmp_path: Pat
     desk, task = Desk(), runs()[0].task
     assert task is not None
     broken: Any = None
-    do(lambda: desk.jobs.perform(of.ChangeFile(broken, False)))
-    until(lambda: desk.happened, "the failure")
-    assert isinstance(desk.happened.pop(), of.EditFailed)
-    do(lambda: desk.jobs.perform(of.CopyToFolder(replace(task, file=None), tmp_path)))
-    until(lambda: desk.happened, "the refusal")
-    (copied,) = desk.happened
+    assert isinstance(desk.event(of.ChangeFile(broken, False)), of.EditFailed)
+    copied = desk.event(of.CopyToFolder(replace(task, file=None), tmp_path))
     assert copied.file is None and copied.state.stage == "refused" and [*tmp_path.iterdir()] == []

@@ -29,7 +29,7 @@ POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
 BASE, TOP = "base · sensor", "top · sensor"
 
 
-def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> ShownCameras | None:
+def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> ShownCameras:
     pictures = {
         (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
     }
@@ -40,7 +40,9 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
         pictures=pictures if pictured else {},
         pictures_serial=serial,
     )
-    return shown_cameras(view)
+    shown = shown_cameras(view)
+    assert shown is not None
+    return shown
 
 
 def test_a_remaining_camera_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
@@ -99,7 +101,6 @@ def test_frequent_pictures_have_the_panels_width_and_the_last_full_size(panels: 
     panel = CamerasPanel(panels.server, clock=clock)
 
     moving = seen(1, (camera("base"),))
-    assert moving is not None
 
     def width_drawn(serial: int, moving: ShownCameras = moving) -> int:
         panel.draw(
@@ -133,7 +134,6 @@ def test_few_pictures_are_sent_while_no_page_shows_the_tab(panels: Panels, clock
 
     def draw(serial: int) -> ShownCameras:
         view = seen(1, (camera("base"),))
-        assert view is not None
         pictures = dict.fromkeys(
             view.pictures, Picture("base", "sensor", 0, POSE, np.full((6, 8, 3), serial, np.uint8))
         )
@@ -170,7 +170,6 @@ def test_only_the_selected_envs_pictures_of_ticked_cameras_and_of_the_studios_ar
     panel = CamerasPanel(panels.server)
     panels.visitors.do = panel.do
     view = seen(1, (camera("base"), camera("hand"), camera("top")))
-    assert view is not None
     panel.draw(view)
     assert {name for _, name in panel.shown_pictures(view)} == {"base"}, "the first is ticked"
     assert {name for _, name in panel.shown_pictures(replace(view, placed=("sensor", "top")))} == {
@@ -186,7 +185,6 @@ def test_only_the_selected_envs_pictures_of_ticked_cameras_and_of_the_studios_ar
 def test_a_picture_of_another_env_is_neither_drawn_nor_unmarked(panels: Panels, clock: Clock) -> None:
     panel = CamerasPanel(panels.server, clock=clock)
     view = seen(1, (camera("base"),))
-    assert view is not None
     panel.draw(view)
     (image,) = panels.part(BASE).images()
     clock.passes()
@@ -201,7 +199,6 @@ def test_a_picture_of_another_env_is_neither_drawn_nor_unmarked(panels: Panels, 
 def test_what_the_task_hides_is_named_at_sensors_and_a_failing_camera_shows_why(panels: Panels) -> None:
     panel = CamerasPanel(panels.server)
     view = seen(1, (camera("base"), camera("people", "human")))
-    assert view is not None
     panel.draw(view)
     panel.draw(replace(view, hidden=("goal",), failed={("sensor", "base"): "It has no such texture."}))
     base, people = panels.part(BASE), panels.part("people · human view")
@@ -216,7 +213,6 @@ def test_a_reload_measures_the_range_of_depth_again(panels: Panels, clock: Clock
     panel = CamerasPanel(panels.server, clock=clock)
     panels.visitors.do = panel.do
     view = seen(1, (camera("base"),))
-    assert view is not None
     panel.draw(view)
     panels.part(BASE).set("depth", True)
 

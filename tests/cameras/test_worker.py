@@ -75,7 +75,7 @@ class Desk:
         line = ServerConnection(theirs.detach(), interrupts, QUESTIONS)
         self.guarded = GuardedTask(line, interrupts, HeartbeatWriter(heartbeat), StepEvents(), lambda: None)
         os.close(heartbeat)
-        self.guarded.opened = opened
+        self.opened = self.guarded.opened = opened
         self.first: list[bool] = []
         self.cameras = WorkerCameras(self.guarded, self.first.append)
 
@@ -94,8 +94,7 @@ class Desk:
         return self.cameras.wait(self.clock.now)
 
     def placed(self, key: CameraKey, **changes: Any) -> CameraSettings:
-        assert self.guarded.opened is not None
-        info = self.guarded.opened.description.camera(key)
+        info = self.opened.description.camera(key)
         assert info is not None and info.settings is not None
         return replace(info.settings, **changes)
 
@@ -117,9 +116,8 @@ def desk(opened: OpenedTask, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
     monkeypatch.setattr(under_test, "time", SimpleNamespace(monotonic=clock.monotonic))
     desk = Desk(opened, clock)
     yield desk
-    desk.guarded.opened = opened
     for key in (BASE, PEOPLE):
-        desk.cameras.place_now(opened, PlaceCamera(key, None))
+        desk.cameras.place_now(desk.opened, PlaceCamera(key, None))
     desk.server.end.close()
 
 
@@ -198,23 +196,19 @@ def test_the_last_waiting_placement_is_made_after_the_picture_and_drawn_first(
 def test_a_resized_sensor_changes_the_observation_and_a_missing_one_is_refused(
     desk: Desk,
 ) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
-    answer = desk.cameras.place_now(opened, PlaceCamera(BASE, desk.placed(BASE, width=40, height=24)))
+    answer = desk.cameras.place_now(desk.opened, PlaceCamera(BASE, desk.placed(BASE, width=40, height=24)))
     assert answer.reshaped and answer.info is not None and (answer.info.width, answer.info.height) == (40, 24)
-    assert opened.env.obs["sensor_data"]["base_camera"]["rgb"].shape == (2, 24, 40, 3)
-    wrong = desk.cameras.place_now(opened, PlaceCamera(("sensor", "nothing"), desk.placed(BASE)))
+    assert desk.opened.env.obs["sensor_data"]["base_camera"]["rgb"].shape == (2, 24, 40, 3)
+    wrong = desk.cameras.place_now(desk.opened, PlaceCamera(("sensor", "nothing"), desk.placed(BASE)))
     assert "nothing" in wrong.why_not and wrong.info is None
 
 
 def test_a_past_step_is_drawn_after_waiting_placements_and_failures_are_sent(desk: Desk) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
     there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
     desk.cameras.watch(0, (SENSOR,))
     desk.iterate()
     desk.cameras.place(PlaceCamera(BASE, there))
-    poses = opened.first.poses[1]
+    poses = desk.opened.first.poses[1]
     desk.cameras.draw_past(DrawPast(poses, 1, (SENSOR,), 7))
     placed, past = desk.received()
     assert isinstance(placed, Placed) and isinstance(past, PastPictures) and past.origin == 7
@@ -241,15 +235,13 @@ def test_hooks_of_an_edited_text_leave_no_attribute_on_the_running_env(opened: O
 
 
 def test_a_moment_is_captured_with_pictures_of_the_given_envs(desk: Desk) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
-    snapshot = pickle.dumps(opened.env.snapshot())
-    with_pictures = desk.cameras.capture(opened, CaptureMoment(snapshot, (1,), pictures=True))
+    snapshot = pickle.dumps(desk.opened.env.snapshot())
+    with_pictures = desk.cameras.capture(desk.opened, CaptureMoment(snapshot, (1,), pictures=True))
     assert {(picture.kind, picture.env) for picture in with_pictures.pictures} == {
         ("sensor", 1),
         ("human", 1),
     }
-    without = desk.cameras.capture(opened, CaptureMoment(snapshot, (1,), pictures=False))
+    without = desk.cameras.capture(desk.opened, CaptureMoment(snapshot, (1,), pictures=False))
     assert without.pictures == () and without.columns.keys() == with_pictures.columns.keys()
 
 
@@ -261,13 +253,11 @@ def no_progress(done: int, total: int) -> None:
 
 
 def test_a_scaled_picture_has_its_own_size_and_the_asked_modalities(desk: Desk) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
     settings = desk.placed(BASE, width=60, height=40)
 
     def drawn(scale: float, *modalities: str, key: CameraKey = BASE, env: int = 1) -> Any:
         question = DrawCamera(key, settings, env, modalities, scale=scale)
-        return desk.cameras.answer(opened, question, no_progress)
+        return desk.cameras.answer(desk.opened, question, no_progress)
 
     half = drawn(0.5, "rgb", "depth", "segmentation")
     assert (half.camera, half.kind, half.env) == ("base_camera", "sensor", 1)
@@ -282,39 +272,35 @@ def test_a_scaled_picture_has_its_own_size_and_the_asked_modalities(desk: Desk) 
         with pytest.raises(CannotAnswer):
             drawn(scale)
     with pytest.raises(CannotAnswer):
-        desk.cameras.answer(opened, DrawCamera(("sensor", "new"), None, 0), no_progress)
+        desk.cameras.answer(desk.opened, DrawCamera(("sensor", "new"), None, 0), no_progress)
     with pytest.raises(CannotAnswer):
         drawn(0.5, env=2)
     assert desk.heartbeat.read().doing == "idle"
 
 
 def test_a_picture_with_other_settings_leaves_the_camera_where_it_is(desk: Desk) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
 
     def pose(settings: CameraSettings | None, env: int = 1, poses: Any = None) -> list[float]:
         question = DrawCamera(BASE, settings, env, ("rgb", "albedo"), poses)
-        picture = desk.cameras.answer(opened, question, no_progress)
+        picture = desk.cameras.answer(desk.opened, question, no_progress)
         assert isinstance(picture, Picture) and picture.env == env and picture.rgb is not None
         return picture.pose[:3].tolist()
 
     there, other = (desk.placed(BASE, position=(0.4, y, 0.7)) for y in (0.1, 0.3))
     before = pose(None)
     assert pose(other) == pytest.approx(other.position) and pose(None) == pytest.approx(before)
-    desk.cameras.place_now(opened, PlaceCamera(BASE, there))
+    desk.cameras.place_now(desk.opened, PlaceCamera(BASE, there))
     assert pose(other) == pytest.approx(other.position) and pose(None) == pytest.approx(there.position)
     assert desk.cameras.placed == {BASE: there}
     with pytest.raises(CannotAnswer):
-        desk.cameras.answer(opened, DrawCamera(BASE, replace(other, near=20.0), 0), no_progress)
+        desk.cameras.answer(desk.opened, DrawCamera(BASE, replace(other, near=20.0), 0), no_progress)
     assert pose(None) == pytest.approx(there.position), "after a failure too"
 
 
 def test_an_env_is_measured_with_the_given_settings_and_poses(desk: Desk) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
 
     def measured(settings: CameraSettings | None = None, env: int = 1, poses: Any = None) -> Any:
-        return desk.cameras.answer(opened, MeasureCamera(BASE, settings, env, poses), no_progress)
+        return desk.cameras.answer(desk.opened, MeasureCamera(BASE, settings, env, poses), no_progress)
 
     (cube,) = measured().wanted_objects(["cube"])
     assert cube.pixels[0] > 0 and measured().envs == (1,)
@@ -322,16 +308,14 @@ def test_an_env_is_measured_with_the_given_settings_and_poses(desk: Desk) -> Non
     assert measured(sky).wanted_objects(["cube"])[0].pixels[0] == 0
     large = desk.placed(BASE, width=512, height=256)
     assert (measured(large).size, measured(large).measured_size) == ((512, 256), (256, 128))
-    poses = opened.first.poses[1].copy()
-    poses[list(opened.description.geometry.body_names).index("cube"), 2] += 50.0
+    poses = desk.opened.first.poses[1].copy()
+    poses[list(desk.opened.description.geometry.body_names).index("cube"), 2] += 50.0
     assert measured(poses=poses).wanted_objects(["cube"])[0].pixels[0] == 0
     with pytest.raises(CannotAnswer):
         measured(env=2)
 
 
 def test_placements_are_put_back_or_forgotten_and_an_unknown_camera_is_told(desk: Desk) -> None:
-    opened = desk.guarded.opened
-    assert opened is not None
     there = desk.placed(PEOPLE, position=(0.5, 0.2, 0.7))
     desk.cameras.place(PlaceCamera(PEOPLE, there))
     desk.cameras.place(PlaceCamera(("sensor", "gone"), there))
@@ -342,9 +326,9 @@ def test_placements_are_put_back_or_forgotten_and_an_unknown_camera_is_told(desk
     assert desk.cameras.placed == {PEOPLE: there}
     desk.cameras.put_back()
     assert desk.cameras.placed == {PEOPLE: there}
-    desk.cameras.place_now(opened, PlaceCamera(PEOPLE, None))
+    desk.cameras.place_now(desk.opened, PlaceCamera(PEOPLE, None))
     assert desk.cameras.placed == {}
-    desk.cameras.place_now(opened, PlaceCamera(PEOPLE, there))
+    desk.cameras.place_now(desk.opened, PlaceCamera(PEOPLE, there))
     desk.cameras.forget_placed()
     assert desk.cameras.placed == {}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from textwrap import dedent
 from typing import Any
 
@@ -40,8 +41,23 @@ LINE = (
 )
 
 
+KEY: CameraKey = ("sensor", "cam")
+
+
+@pytest.fixture
+def before() -> CameraSettings:
+    """The first of `TWO`'s cameras."""
+    return real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+
+
 def higher(now: CameraSettings) -> CameraSettings:
     return dataclasses.replace(now, position=(0.5, 0.0, 0.75))
+
+
+def edit(
+    sources: Mapping[str, str], before: CameraSettings, after: CameraSettings, run: RunHooks = run_class
+) -> SourceEdit | RefusedEdit:
+    return planned(plan_edit, sources, KEY, before, after, run)
 
 
 def edited_line(plan: SourceEdit | RefusedEdit) -> int:
@@ -55,9 +71,7 @@ def test_cameras_of_equal_name_and_value_are_distinguished_by_their_place() -> N
     source = TWO.replace("512, 512", "128, 128").replace('f"{name}"', '"cam"')
     before = real_settings({FILE: source}, "cam", "_default_sensor_configs")
     for class_name, line in (("Task", LINE), ("Other", LINE + 11)):
-        plan = planned(
-            plan_edit, {FILE: source}, ("sensor", "cam"), before, higher(before), run_as(class_name)
-        )
+        plan = edit({FILE: source}, before, higher(before), run_as(class_name))
         assert edited_line(plan) == line
 
 
@@ -75,19 +89,15 @@ def test_cameras_of_equal_name_and_value_are_distinguished_by_their_place() -> N
         {"height": 2.5},
     ],
 )
-def test_invalid_camera_settings_are_never_written(change: dict[str, Any]) -> None:
-    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = planned(
-        plan_edit, {FILE: TWO}, ("sensor", "cam"), before, dataclasses.replace(before, **change), run_class
-    )
+def test_invalid_camera_settings_are_never_written(before: CameraSettings, change: dict[str, Any]) -> None:
+    plan = edit({FILE: TWO}, before, dataclasses.replace(before, **change))
     assert isinstance(plan, RefusedEdit) and not plan.snippet
 
 
 def forged_report(ran: HookCameras, **changes: Any) -> RunHooks:
     """Run hooks as a worker that reports `changes` for the camera."""
-    key: CameraKey = ("sensor", "cam")
     return lambda sources: HookCameras(
-        {**ran.cameras, key: dataclasses.replace(ran.cameras[key], **changes)}, ran.owners
+        {**ran.cameras, KEY: dataclasses.replace(ran.cameras[KEY], **changes)}, ran.owners
     )
 
 
@@ -100,10 +110,11 @@ def forged_report(ran: HookCameras, **changes: Any) -> RunHooks:
     ],
 )
 @pytest.mark.parametrize("of", ["call", "argument", "read", "part"])
-def test_a_worker_that_reports_false_places_changes_nothing(place: Place, reason: str, of: str) -> None:
-    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+def test_a_worker_that_reports_false_places_changes_nothing(
+    before: CameraSettings, place: Place, reason: str, of: str
+) -> None:
     ran = run_class({FILE: TWO})
-    trace = ran.cameras["sensor", "cam"].trace
+    trace = ran.cameras[KEY].trace
     assert trace is not None
     pose = trace.parts["pose"]
     if of == "call":
@@ -119,16 +130,13 @@ def test_a_worker_that_reports_false_places_changes_nothing(place: Place, reason
         vector = dataclasses.replace(pose.parts["p"], parts={**pose.parts["p"].parts, "2": item})
         lie = dataclasses.replace(pose, parts={**pose.parts, "p": vector})
         trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
-    plan = planned(
-        plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), forged_report(ran, trace=trace)
-    )
+    plan = edit({FILE: TWO}, before, higher(before), forged_report(ran, trace=trace))
     assert isinstance(plan, RefusedEdit) and reason in plan.reason
 
 
-def test_an_installed_file_is_left_alone() -> None:
+def test_an_installed_file_is_left_alone(before: CameraSettings) -> None:
     path = "/usr/lib/python3/site-packages/mani_skill/envs/tasks/task.py"
-    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = planned(plan_edit, {path: TWO}, ("sensor", "cam"), before, higher(before), run_class)
+    plan = edit({path: TWO}, before, higher(before))
     assert isinstance(plan, RefusedEdit) and "copy the task" in plan.reason
 
 
@@ -155,7 +163,7 @@ IMPORTING = HEADER + dedent(
 def test_a_constant_of_another_file_is_changed_there() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
-    plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
+    plan = edit(sources, before, higher(before))
     assert isinstance(plan, SourceEdit), plan
     assert plan.file == "/author/places.py"
     assert "EYE = np.array([0.5, 0, 0.75])  # above the table" in plan.new_text
@@ -169,7 +177,7 @@ def test_a_constant_that_another_file_reads_stays_unchanged() -> None:
         "/author/more.py": "from places import EYE\nx = EYE\n",
     }
     before = real_settings(sources, "cam")
-    plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
+    plan = edit(sources, before, higher(before))
     assert isinstance(plan, SourceEdit) and plan.file == FILE
     assert "sapien.Pose([0.5, 0, 0.75])" in plan.new_text
     assert any("more.py" in note for note in plan.notes)
@@ -179,7 +187,7 @@ def test_one_plan_can_change_two_files() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     after = dataclasses.replace(higher(before), height=100)
-    plan = planned(plan_edit, sources, ("sensor", "cam"), before, after, run_class)
+    plan = edit(sources, before, after)
     assert isinstance(plan, SourceEdit), plan
     assert [change.file for change in plan.changes] == [FILE, "/author/places.py"]
     assert "places.SIZE, 100, 1.0" in plan.new_text and "[0.5, 0, 0.75]" in plan.others[0].new_text
@@ -190,16 +198,13 @@ def test_one_plan_can_change_two_files() -> None:
     assert plan.settings == real_settings(sources | new, "cam")
 
 
-def test_settings_that_env_arguments_override_are_left_alone_with_a_note() -> None:
-    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+def test_settings_that_env_arguments_override_are_left_alone_with_a_note(before: CameraSettings) -> None:
     running = dataclasses.replace(before, width=640, height=480)
-    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), running, higher(running), run_class)
+    plan = edit({FILE: TWO}, running, higher(running))
     assert isinstance(plan, SourceEdit) and plan.settings is not None
     assert (plan.settings.width, plan.settings.height) == (640, 480)
     assert "not changed there" in plan.notes[-1]
-    plan = planned(
-        plan_edit, {FILE: TWO}, ("sensor", "cam"), running, dataclasses.replace(running, width=320), run_class
-    )
+    plan = edit({FILE: TWO}, running, dataclasses.replace(running, width=320))
     assert isinstance(plan, RefusedEdit) and "gym.make" in plan.reason
 
 
@@ -246,6 +251,6 @@ def test_a_change_that_would_also_change_another_camera_is_refused() -> None:
     )
     sources = {FILE: source, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
-    plan = planned(plan_edit, sources, ("sensor", "cam"), before, higher(before), run_class)
+    plan = edit(sources, before, higher(before))
     assert isinstance(plan, RefusedEdit) and "also change the camera hand" in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet
