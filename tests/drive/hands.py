@@ -1,4 +1,4 @@
-"""A `HandsPanel` without the rest of the page."""
+"""A `HandsPanel` without the rest of the page, and the edits of where episodes begin in a session."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ import numpy as np
 from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
+from tests.drive.session import wait_until
+from workbench.app.session import Session
 from workbench.envs.scene.shapes import BodyKind
+from workbench.hands.commands import RevertStartChange, SaveStartChange
 from workbench.hands.panel import HandsPanel
+from workbench.hands.start_edit import StartEdit
 
 OFFSET = np.array([5.0, 0.0, 0.0])
 MIDDLE = np.zeros(3)
@@ -53,3 +57,24 @@ class Hands:
         phases = ["start", *["update"] * (len(ends) - 1)]
         for phase, end in zip(phases, ends, strict=True):
             self.panel.drag(PAGE, phase, start, end + OFFSET, EYE, lifts)  # type: ignore[arg-type]
+
+
+def edit_reaches(session: Session, *stages: str) -> StartEdit:
+    """Wait until the edit of the start is at one of these stages."""
+    return wait_until(session, lambda v: v.of(StartEdit).stage in stages, " or ".join(stages)).of(StartEdit)
+
+
+def save_planned_edit(session: Session) -> None:
+    """Save the edit of the start that is being planned, and wait until a run has shown its effect."""
+    planned = edit_reaches(session, "planned", "refused")
+    assert planned.stage == "planned", planned.message
+    session.do(SaveStartChange())
+    done = edit_reaches(session, "checked", "mismatch", "refused")
+    assert done.stage == "checked", done.message
+
+
+def revert_edit(session: Session) -> None:
+    session.do(RevertStartChange())
+    wait_until(
+        session, lambda v: v.of(StartEdit).stage == "undone" and not v.of(StartEdit).writing, "the old text"
+    )

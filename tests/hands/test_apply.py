@@ -27,7 +27,7 @@ from workbench.hands.drive_keys import SHARE
 from workbench.hands.reach import ArmDragged, Reach, stepped
 from workbench.hands.start_edit import PlanStart, RobotQpos
 from workbench.hands.state import BodyMoved, BodyPulled, Driven, DrivingDue, Hands, apply
-from workbench.live.events import PagesCounted, SettingsChanged, WorkerDied
+from workbench.live.events import MomentShown, PagesCounted, SettingsChanged, WorkerDied
 from workbench.live.messages import (
     MoveBody,
     MoveJoints,
@@ -38,7 +38,7 @@ from workbench.live.messages import (
     SetSliderAction,
     Status,
 )
-from workbench.page.command import Refused
+from workbench.page.command import Command, Refused
 from workbench.task.description import ActionDimension, ArmDescription, Restored
 
 ENVS = 4
@@ -111,13 +111,15 @@ def test_a_paused_body_joint_or_keyframe_moves_in_one_request(
 
 
 def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorkerSession) -> None:
-    before = hands(fake)
+    fake.session.do(ToggleReach())
+    before, nan = hands(fake), (math.nan,) * 7
 
     def refuse(*wrong: Any) -> None:
         for one in wrong:
             with pytest.raises(Refused):
-                fake.session.happen(one) if isinstance(one, BodyMoved | BodyPulled) else fake.session.do(one)
-        assert hands(fake) == before and not fake.asked(MoveJoints | MoveBody | SetSliderAction)  # type: ignore[arg-type]
+                (fake.session.do if isinstance(one, Command) else fake.session.happen)(one)
+        assert hands(fake) == before
+        assert not fake.asked(MoveJoints | MoveBody | PullBody | ReachPose | SetSliderAction)  # type: ignore[arg-type]
 
     refuse(
         SetJoint(robot="left", joint=2, to=0.0),
@@ -126,10 +128,20 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
     )
     refuse(
         UseKeyframe(robot="right", name="rest"),
-        BodyMoved("ground", (0,), FAR),
-        BodyMoved("cube", (0,), (math.inf,) * 7),
+        *(BodyMoved(name, (0,), FAR) for name in ("ground", TIP, "nothing")),
+        *(BodyMoved("cube", (0,), pose) for pose in ((math.inf,) * 7, (0.0,) * 7, nan)),
+        *(ArmDragged(TIP, 1, pose) for pose in ((0.4, 0.2, 0.1, 0.0, 0.0, 0.0, 0.0), nan)),
+        BodyPulled(PullBody("table", 1)),
     )
-    refuse(BodyPulled(PullBody("table", 1)), BodyMoved("cube", (0,), (0.0,) * 7))
+    fake.session.happen(MomentShown(0))
+    refuse(
+        DragJoint(robot="left", joint=0, to=0.0),
+        SetJoint(robot="left", joint=0, to=0.0),
+        UseKeyframe(robot="left", name="rest"),
+        BodyMoved("cube", (0,), FAR),
+        BodyPulled(PullBody("cube")),
+    )
+    fake.session.happen(MomentShown(None))
     play(fake)
     refuse(UseKeyframe(robot="left", name="rest"), BodyMoved("cube", (0,), FAR))
     refuse(SetJoint(robot="right", joint=0, to=0.0), DragJoint(robot="left", joint=1, to=0.1))
@@ -140,6 +152,8 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
     load(fake, "rebuilt", actions=ABSOLUTE)
     fake.reset()
     refuse(ToggleDriving(), WriteQpos("left"))
+    fake.session.happen(Driven(("w",), 0.0))
+    assert hands(fake) == before, "keys count only for one who drives"
 
 
 def test_links_are_pulled_where_forces_reach_them(fake: FakeWorkerSession) -> None:

@@ -23,11 +23,10 @@ from workbench.hands.commands import ToggleDriving
 from workbench.hands.drive_keys import KEYS, PAIRS, SHARE, bindings, driven_action
 from workbench.hands.drive_panel import yaw_of
 from workbench.hands.state import Driven, Hands, apply
-from workbench.live.commands import PauseRun, UseControlMode
+from workbench.live.commands import PauseRun
 from workbench.live.events import Send
 from workbench.live.messages import SetSliderAction, Settings
 from workbench.live.run import first_run
-from workbench.page.command import Refused
 from workbench.task.description import ActionDimension, TaskOptions
 
 ARM = tuple(ActionDimension(f"arm/{axis}", -1.0, 2.0) for axis in ("x", "y", "z", "rx", "ry", "rz"))
@@ -149,21 +148,3 @@ def test_a_held_key_moves_the_robot_until_it_is_released_or_the_page_is_silent(s
     assert not view.of(Hands).driving
     assert (view.settings.action_source, view.settings.episode_end) == ("random", "reset")
     session.do(PauseRun())
-
-
-def test_choosing_another_source_of_actions_takes_over(session: Session) -> None:
-    session.do(ToggleDriving())
-    session.change(action_source="hold")
-    view = session.view()
-    assert not view.of(Hands).driving and view.settings.action_source == "hold"
-    session.happen(Driven(("w",), 0))
-    assert not session.view().of(Hands).keys
-    session.do(PauseRun())
-
-
-def test_a_mode_of_absolute_targets_is_refused(session: Session) -> None:
-    session.do(UseControlMode(mode="pd_joint_pos"))
-    wait_until(session, lambda v: v.task.control_mode == "pd_joint_pos" and v.state == "paused", "the mode")
-    with pytest.raises(Refused, match="pd_joint_pos"):
-        session.do(ToggleDriving())
-    assert not session.view().of(Hands).driving

@@ -13,12 +13,11 @@ import pytest
 from tests.drive.session import jump, live_session, moment_at, start_over, step
 from workbench.app.session import Session
 from workbench.hands.state import BodyMoved, BodyPulled
-from workbench.live.commands import PauseRun, PlayRun
+from workbench.live.commands import PauseRun
 from workbench.live.events import MomentShown, SlidersMoved
 from workbench.live.history.moments import BY_HAND
 from workbench.live.messages import PullBody
 from workbench.live.timeline_commands import ContinueFromHere, UndoReset
-from workbench.page.command import Refused
 
 N = 3
 AWAY = (0.1, 0.25, 0.3, 1.0, 0.0, 0.0, 0.0)
@@ -151,25 +150,3 @@ def test_a_link_is_pulled_with_the_weight_of_its_arm(session: Session) -> None:
     session.happen(BodyPulled(PullBody()))
     raised = body(session, hand)[:, 2] - before[:, 2]
     assert raised[1] > 0.1 and abs(raised[0]) < 0.02
-
-
-@pytest.mark.parametrize("name", ["panda/panda_hand", "ground", "nothing"])
-def test_what_cannot_be_moved_is_refused(session: Session, name: str) -> None:
-    fresh(session)
-    last = session.view().timeline.last
-    with pytest.raises(Refused):
-        session.happen(BodyMoved(name, (0,), AWAY))
-    assert session.view().timeline.last == last
-
-
-def test_the_past_and_a_running_env_are_not_moved(session: Session) -> None:
-    start = fresh(session)
-    step(session, 2)
-    session.happen(MomentShown(start))
-    for event in (BodyMoved("cube", (0,), AWAY), BodyPulled(PullBody("cube"))):
-        with pytest.raises(Refused):
-            session.happen(event)
-    session.do(PlayRun())
-    with pytest.raises(Refused):
-        session.happen(BodyMoved("cube", (0,), AWAY))
-    session.do(PauseRun())

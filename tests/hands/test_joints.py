@@ -163,40 +163,6 @@ def test_a_recording_in_progress_ends_at_it(session: Session) -> None:
     wait_until(session, lambda v: not v.of(RecordingStatus).active, "the end of the recording")
 
 
-@pytest.mark.parametrize(
-    ("command", "why"),
-    [
-        (SetJoint(robot="fetch", joint=0, to=0.0), "no such robot"),
-        (SetJoint(robot=PANDA, joint=9, to=0.0), "only 9 joints"),
-        (UseKeyframe(robot=PANDA, name="up"), "no keyframe up"),
-    ],
-)
-def test_what_the_robot_lacks_is_refused(session: Session, command: Any, why: str) -> None:
-    last = fresh(session)
-    with pytest.raises(Refused, match=why):
-        session.do(command)
-    assert session.view().timeline.last == last
-
-
-def test_the_past_and_a_running_env_are_not_set(session: Session) -> None:
-    start = fresh(session)
-    step(session, 2)
-    session.happen(MomentShown(start))
-    for command in (
-        DragJoint(robot=PANDA, joint=0, to=0.0),
-        SetJoint(robot=PANDA, joint=0, to=0.0),
-        UseKeyframe(robot=PANDA, name="rest"),
-    ):
-        with pytest.raises(Refused, match="past"):
-            session.do(command)
-    session.do(PlayRun())
-    with pytest.raises(Refused, match="Pause"):
-        session.do(UseKeyframe(robot=PANDA, name="rest"))
-    with pytest.raises(Refused, match="pd_joint_delta_pos takes no position of panda_joint4"):
-        session.do(SetJoint(robot=PANDA, joint=ELBOW, to=0.0))
-    session.do(PauseRun())
-
-
 def test_while_it_plays_a_slider_drives_its_joint_in_a_mode_of_positions(session: Session) -> None:
     fresh(session)
     session.do(UseControlMode(mode="pd_joint_pos"))

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, jump, live_session, runs, wait_until
+from tests.drive.hands import edit_reaches, revert_edit, save_planned_edit
+from tests.drive.session import TASKS, jump, live_session, runs
 from workbench.app.session import Session
-from workbench.hands.commands import RevertStartChange, SaveStartChange, SetJoint, WriteQpos
+from workbench.hands.commands import SetJoint, WriteQpos
 from workbench.hands.qpos_source import find_qpos, plan_qpos, without_noise
-from workbench.hands.start_edit import StartEdit
 from workbench.page.command import Refused
 from workbench.source.parsed import RefusedEdit
 
@@ -36,10 +36,6 @@ def session(child_process: None, file: Path, tmp_path_factory: pytest.TempPathFa
         yield session
 
 
-def edit(session: Session, *stages: str) -> StartEdit:
-    return wait_until(session, lambda v: v.of(StartEdit).stage in stages, " or ".join(stages)).of(StartEdit)
-
-
 def test_a_keyframe_to_which_a_reset_adds_noise_is_written_checked_and_reverted(
     session: Session, file: Path
 ) -> None:
@@ -49,17 +45,11 @@ def test_a_keyframe_to_which_a_reset_adds_noise_is_written_checked_and_reverted(
     jump(session, lambda: session.do(SetJoint(ROBOT, 0, 28.6478898)))
     jump(session, lambda: session.do(SetJoint(ROBOT, 1, 45.8366236)))
     session.do(WriteQpos(ROBOT))
-    planned = edit(session, "planned", "refused")
-    assert planned.stage == "planned", planned.message
+    edit_reaches(session, "planned", "refused")
     assert file.read_text() == text, "nothing is written yet"
-    session.do(SaveStartChange())
-    done = edit(session, "checked", "mismatch", "refused")
-    assert done.stage == "checked", done.message
+    save_planned_edit(session)
     assert file.read_text() == text.replace("np.array([0.0, 1.2, 0.0])", "np.array([0.5, 0.8, 0.0])")
-    session.do(RevertStartChange())
-    wait_until(
-        session, lambda v: v.of(StartEdit).stage == "undone" and not v.of(StartEdit).writing, "the old text"
-    )
+    revert_edit(session)
     assert file.read_text() == text
 
 
@@ -70,7 +60,7 @@ def test_noise_that_the_seed_does_not_decide_is_noted(session: Session, file: Pa
     runs(session, unseeded)
     jump(session, lambda: session.do(SetJoint(ROBOT, 0, 28.6478898)))
     session.do(WriteQpos(ROBOT))
-    planned = edit(session, "planned", "refused")
+    planned = edit_reaches(session, "planned", "refused")
     assert planned.edit is not None, planned.message
     assert any(ROBOT in note for note in planned.edit.notes)
     file.write_text(text)

@@ -16,9 +16,8 @@ from tests.drive.session import jump, live_session, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import SetJoint, ToggleDriving, ToggleReach
 from workbench.hands.reach import ArmDragged, Reach, loaded
-from workbench.hands.state import BodyMoved, Driven, Hands
+from workbench.hands.state import Hands
 from workbench.live.commands import PauseRun, PlayRun, UseControlMode
-from workbench.live.events import SettingsChanged
 from workbench.live.history.moments import BY_HAND
 from workbench.live.messages import Settings
 from workbench.live.run import first_run
@@ -133,22 +132,6 @@ def test_a_paused_arm_is_put_at_its_target_in_one_event_and_undone(session: Sess
     assert apart(jump(session, lambda: session.do(UndoReset())), start[1]) < 1e-6
 
 
-def test_keys_take_the_arm_out_of_the_handles_and_a_reset_lets_go(session: Session) -> None:
-    start = fresh(session)
-    lead(session, start[1] + WAY)
-    session.happen(Driven(("g",), 0.0))
-    assert KEY in reach(session).targets, "the gripper is not the arm"
-    session.happen(Driven(("w",), 0.0))
-    assert not reach(session).targets
-    session.happen(Driven((), 0.0))
-    drag(session, start[1] + FAR)
-    assert reach(session).targets
-    start_over(session, 1)
-    assert not reach(session).targets
-    session.happen(SettingsChanged({"action_source": "random"}))
-    assert not session.view().of(Hands).driving
-
-
 def test_an_arm_stays_where_a_slider_has_put_it_afterwards(session: Session) -> None:
     start = fresh(session)
     lead(session, start[1] + WAY)
@@ -165,15 +148,6 @@ def test_why_a_move_fell_short_is_shown_until_the_reset(session: Session) -> Non
     assert reach(session).reached[KEY].why
     start_over(session, 1)
     assert not reach(session).reached
-
-
-def test_a_pose_of_other_than_numbers_is_refused(session: Session) -> None:
-    start = fresh(session)
-    for pose in (np.full(7, np.nan), np.array([*start[1, :3], 0, 0, 0, 0])):
-        with pytest.raises(Refused):
-            drag(session, pose)
-        with pytest.raises(Refused):
-            session.happen(BodyMoved("cube", (1,), tuple(map(float, pose))))
 
 
 def test_without_an_arm_another_task_has_no_handles() -> None:

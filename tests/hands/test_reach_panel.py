@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ class Page:
         self.panel.draw(view)
         return poses
 
-    def gizmo(self) -> object:
+    def gizmo(self) -> Any:
         return next(iter(self.panels.nodes("/hands/reach/0")), None)
 
 
@@ -64,14 +65,14 @@ def test_the_handles_are_at_the_end_effector_until_they_are_dragged(page: Page) 
     page.show(Reach())
     assert page.gizmo() is None
     poses = page.show(Reach(shown=True))
-    gizmo: object = page.gizmo()
+    gizmo = page.gizmo()
     hand = seen(Reach()).task.geometry.body_names.index(ARM)  # type: ignore[union-attr]
-    assert gizmo.visible  # type: ignore[attr-defined]
-    np.testing.assert_allclose(gizmo.position, poses[1, hand, :3] + OFFSET, atol=1e-6)  # type: ignore[attr-defined]
+    assert gizmo.visible
+    np.testing.assert_allclose(gizmo.position, poses[1, hand, :3] + OFFSET, atol=1e-6)
     page.show(led())
-    np.testing.assert_allclose(gizmo.position, np.array(TARGET[:3]) + OFFSET, atol=1e-6)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(gizmo.position, np.array(TARGET[:3]) + OFFSET, atol=1e-6)
     page.show(Reach())
-    assert not gizmo.visible  # type: ignore[attr-defined]
+    assert not gizmo.visible
 
 
 def test_a_drag_reports_the_pose_in_the_frame_of_the_env_and_its_end(page: Page) -> None:

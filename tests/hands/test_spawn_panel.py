@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ class Page:
         self.hands.session.shown = self.hands.view
         self.hands.redraw()
 
-    def gizmo(self, side: str) -> object:
+    def gizmo(self, side: str) -> Any:
         (gizmo,) = self.panels.nodes(f"/hands/spawn/{side}")
         return gizmo
 
@@ -53,15 +54,15 @@ def test_the_handles_are_at_the_sides_of_the_box_in_the_selected_env(page: Page)
         "y_min": (0.1, -0.2),
         "y_max": (0.1, 0.2),
     }.items():
-        np.testing.assert_allclose(page.gizmo(side).position, np.array([*at, height]) + OFFSET, atol=1e-6)  # type: ignore[attr-defined]
-        assert page.gizmo(side).visible  # type: ignore[attr-defined]
+        np.testing.assert_allclose(page.gizmo(side).position, np.array([*at, height]) + OFFSET, atol=1e-6)
+        assert page.gizmo(side).visible
 
 
 def test_the_box_of_another_body_and_a_side_that_is_not_drawn_have_no_handles(page: Page) -> None:
     page.show(replace(BOX, measured=(RANGES[0], None), wanted=(RANGES[0], None)))
-    assert page.gizmo("x_min").visible and not page.gizmo("y_min").visible  # type: ignore[attr-defined]
+    assert page.gizmo("x_min").visible and not page.gizmo("y_min").visible
     page.show(replace(BOX, body="table"))
-    assert not page.gizmo("x_min").visible  # type: ignore[attr-defined]
+    assert not page.gizmo("x_min").visible
 
 
 def test_a_drag_reports_the_side_in_the_frame_of_the_env_and_belongs_to_one_page(page: Page) -> None:
@@ -82,10 +83,10 @@ def test_a_dragged_handle_stays_under_the_pointer_until_its_page_lets_go(page: P
     wider = replace(BOX, wanted=((-0.1, 0.5), RANGES[1]))
     page.spawn.drag(PAGE, "x_max", "start", np.zeros(3))
     page.show(wider)
-    assert page.gizmo("x_max").position[0] == pytest.approx(0.3 + OFFSET[0])  # type: ignore[attr-defined]
+    assert page.gizmo("x_max").position[0] == pytest.approx(0.3 + OFFSET[0])
     page.spawn.follow()  # the page has closed
     page.show(wider)
-    assert page.gizmo("x_max").position[0] == pytest.approx(0.5 + OFFSET[0])  # type: ignore[attr-defined]
+    assert page.gizmo("x_max").position[0] == pytest.approx(0.5 + OFFSET[0])
 
 
 def test_the_tool_asks_for_the_range_of_the_selected_body_and_hides_it(live_page: Live) -> None:

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, jump, live_session, runs, start_over, wait_until
+from tests.drive.hands import edit_reaches, revert_edit, save_planned_edit
+from tests.drive.session import TASKS, jump, live_session, runs, save, start_over
 from workbench.app.session import Session
-from workbench.hands.commands import DropStartChange, RevertStartChange, SaveStartChange
+from workbench.hands.commands import DropStartChange, SaveStartChange
 from workbench.hands.start_edit import BodyPose, StartEdit, StartWanted
 from workbench.hands.state import BodyMoved
-from workbench.live.commands import PauseRun, PlayRun
-from workbench.page.command import Refused
+from workbench.live.commands import PauseRun
 
 THERE = (0.12, -0.2, 0.03, 0.9238795, 0.0, 0.0, 0.3826834)
 MINIMAL = (TASKS / "minimal.py").read_text()
@@ -53,20 +53,11 @@ def opened(session: Session, file: Path) -> Session:
     return session
 
 
-def load(session: Session, file: Path, text: str) -> None:
-    file.write_text(text)
-    runs(session, text)
-
-
-def edit(session: Session, *stages: str) -> StartEdit:
-    return wait_until(session, lambda v: v.of(StartEdit).stage in stages, " or ".join(stages)).of(StartEdit)
-
-
 def want(session: Session) -> StartEdit:
     """Move the cube, ask to write its pose, and wait for the plan."""
     jump(session, lambda: session.happen(BodyMoved("cube", (0, 1), THERE)))
     session.happen(StartWanted(BodyPose("cube", THERE)))
-    return edit(session, "planned", "refused")
+    return edit_reaches(session, "planned", "refused")
 
 
 def first_poses(session: Session, seed: int) -> np.ndarray:
@@ -80,12 +71,9 @@ def changed_lines(old: str, new: str) -> list[str]:
 
 
 def test_a_pose_of_each_reset_is_shown_saved_checked_and_reverted(opened: Session, file: Path) -> None:
-    planned = want(opened)
-    assert planned.stage == "planned", planned.message
+    want(opened)
     assert file.read_text() == MINIMAL, "nothing is written yet"
-    opened.do(SaveStartChange())
-    done = edit(opened, "checked", "mismatch", "refused")
-    assert done.stage == "checked", done.message
+    save_planned_edit(opened)
     assert changed_lines(MINIMAL, file.read_text()) == [
         "-         p = torch.tensor([0, 0, 0.03], device=self.device).repeat(len(env_idx), 1)",
         "+         p = torch.tensor([0.12, -0.2, 0.03], device=self.device).repeat(len(env_idx), 1)",
@@ -93,10 +81,7 @@ def test_a_pose_of_each_reset_is_shown_saved_checked_and_reverted(opened: Sessio
         "+         self.cube.set_pose(Pose.create_from_pq(p=p, q=[0.9238795, 0.0, 0.0, 0.3826834]))",
     ]
     np.testing.assert_allclose(first_poses(opened, 7), [THERE, THERE], atol=1e-4)
-    opened.do(RevertStartChange())
-    wait_until(
-        opened, lambda v: v.of(StartEdit).stage == "undone" and not v.of(StartEdit).writing, "the old text"
-    )
+    revert_edit(opened)
     assert file.read_text() == MINIMAL
 
 
@@ -104,11 +89,9 @@ def test_a_builders_pose_is_written_where_no_reset_sets_another(opened: Session,
     text = MINIMAL
     for line in RESET_LINES:
         text = text.replace(line, "")
-    load(opened, file, text)
-    planned = want(opened)
-    assert planned.stage == "planned", planned.message
-    opened.do(SaveStartChange())
-    assert edit(opened, "checked", "mismatch").stage == "checked"
+    save(opened, file, text)
+    want(opened)
+    save_planned_edit(opened)
     assert [line.strip("+- ") for line in changed_lines(text, file.read_text())] == [
         "builder.initial_pose = sapien.Pose(p=[0, 0, 0.03])",
         "builder.initial_pose = sapien.Pose(p=[0.12, -0.2, 0.03], q=[0.9238795, 0.0, 0.0, 0.3826834])",
@@ -125,7 +108,7 @@ def test_a_text_whose_run_does_not_give_the_pose_is_refused(opened: Session, fil
     for line in RESET_LINES:
         text = text.replace(line, moved)
         moved = ""
-    load(opened, file, text)
+    save(opened, file, text)
     planned = want(opened)
     assert planned.stage == "refused" and "a run of the changed file shows" in planned.message
     assert "sapien.Pose(p=[0.12, -0.2, 0.03]" in planned.snippet
@@ -142,37 +125,16 @@ def test_what_the_seed_does_not_decide_is_not_blamed_on_the_change(opened: Sessi
         + "        self.post.set_pose(Pose.create_from_pq(p=[*np.random.uniform(1, 2, 2), 0.03]))\n"
         + "        self.shadow.set_pose(Pose.create_from_pq(p=p + torch.tensor([0.0, 0.0, 1.0])))\n",
     )
-    load(opened, file, text)
+    save(opened, file, text)
     planned = want(opened)
     assert planned.edit is not None, planned.message
     named = [{name for name in ("cube", "post", "shadow") if name in note} for note in planned.edit.notes]
     assert named == [{"shadow"}, {"post"}]
 
 
-def test_a_random_pose_is_refused(opened: Session, file: Path) -> None:
-    text = MINIMAL.replace(
-        "torch.tensor([0, 0, 0.03], device=self.device).repeat(len(env_idx), 1)",
-        "torch.rand((len(env_idx), 3))",
-    )
-    assert text != MINIMAL
-    load(opened, file, text)
-    planned = want(opened)
-    assert planned.stage == "refused" and "cube" in planned.message and "0.12" in planned.snippet
-
-
 def test_an_edit_that_the_author_made_meanwhile_is_not_overwritten(opened: Session, file: Path) -> None:
     assert want(opened).stage == "planned"
-    load(opened, file, MINIMAL + "# mine\n")
+    save(opened, file, MINIMAL + "# mine\n")
     opened.do(SaveStartChange())
-    done = edit(opened, "refused")
+    done = edit_reaches(opened, "refused")
     assert "edited since" in done.message and file.read_text() == MINIMAL + "# mine\n"
-
-
-def test_what_was_not_read_is_not_saved_and_a_running_body_is_not_written(opened: Session) -> None:
-    for command in (SaveStartChange(), RevertStartChange()):
-        with pytest.raises(Refused):
-            opened.do(command)
-    opened.do(PlayRun())
-    with pytest.raises(Refused, match="Pause"):
-        opened.happen(StartWanted(BodyPose("cube", THERE)))
-    opened.do(PauseRun())

@@ -50,7 +50,7 @@ OLD, NEW = "x = 1\n", "x = 2\n"
 EDIT = SourceEdit("push.py", OLD, NEW, (), None)
 THERE = BodyPose("cube", (0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 SEEN = (-0.1, 0.1), (-0.2, 0.2)
-RANGES = (-0.15, 0.15), None
+RANGES: tuple[tuple[float, float], None] = (-0.15, 0.15), None
 
 
 @pytest.fixture
@@ -94,6 +94,9 @@ def test_a_change_is_planned_saved_checked_and_reverted_with_its_own_number(
 ) -> None:
     session = loaded.session
     session.change(selected_env=1)
+    for command in (SaveStartChange(), RevertStartChange()):
+        with pytest.raises(Refused):
+            session.do(command)
     for round in range(2):
         number = planned(loaded)
         plan = begun.pop()
@@ -239,10 +242,14 @@ def test_a_side_moves_alone_and_stays_a_millimetre_from_the_other(loaded: FakeWo
         SpawnDragged("y_min", 0.0),
         SpawnDragged("x_min", 2e3),
         SpawnDragged("x_max", float("nan")),
+        SpawnDragged("x_max", float("inf")),
+        SpawnAsked("no such body"),
     ):
         with pytest.raises(Refused):
             loaded.session.happen(wrong)
     assert box_of(loaded) == before
+    loaded.session.happen(SpawnDragged("x_min", 1.0))
+    assert box_of(loaded).wanted == ((RANGES[0][1] - MIN_WIDTH_METRES, RANGES[0][1]), None)
 
 
 def test_a_new_version_is_measured_again_beside_the_old_box(
@@ -263,5 +270,7 @@ def test_a_new_version_is_measured_again_beside_the_old_box(
     begun.clear()
     loaded.session.do(HideSpawn())
     assert begun == [EndSpawn()] and box_of(loaded) == SpawnBox(number=again.number + 2)
+    with pytest.raises(Refused):
+        loaded.session.happen(SpawnDragged("x_min", 0.0))
     reload(loaded, OLD)
     assert begun == [EndSpawn()], "a hidden range is not measured"
