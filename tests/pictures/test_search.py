@@ -162,14 +162,12 @@ def test_objects_to_see_are_the_tasks_and_the_robots_links_from_the_hand(env: An
     ]
     assert robot.robot and robot.name == "panda" and robot.links[0] == "panda/panda_hand"
     assert set(robot.links[1:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger"}
-    assert "panda/panda_link0" in robot.links and "panda/panda_hand_tcp" not in robot.links
+    assert "panda/panda_link0" in robot.links
+    assert "panda/panda_hand_tcp" not in robot.links, "a link without visual shapes"
 
 
 @pytest.mark.slow
 def test_the_robots_hand_can_be_a_wanted_object_that_the_arm_hides(env: Any) -> None:
-    (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
-    assert set(robot.links[:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger", "panda/panda_hand"}
-    assert "panda/panda_hand_tcp" not in robot.links, "a link without visual shapes"
     hand = "panda/panda_hand"
     space = SearchSpace((hand, "cube"), LOW, HIGH, LENS, candidates=16, best=1)
     (found,) = suggest_cameras(env, space, range(N))

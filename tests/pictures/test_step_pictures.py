@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.envs.drawn_envs import batched
 from tests.envs.stock_env import batch_of
 from tests.envs.watched import RENDERED, Watched
 from workbench.envs.task_env import TaskEnv
@@ -22,7 +21,16 @@ pytestmark = pytest.mark.usefixtures("renderer")
 ALL = ("rgb", "depth", "segmentation")
 
 
-def test_each_env_has_its_own_picture_in_the_order_of_the_requests() -> None:
+def test_each_env_has_its_own_picture_in_the_order_of_the_requests_and_none_is_rendered_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rendered: list[str] = []
+
+    def render(env: Any, number: int, requests: Any) -> Any:
+        rendered.extend(name for name, _, _ in requests)
+        return take_pictures(env, number, requests)
+
+    monkeypatch.setattr(module, "take_pictures", render)
     task = TaskEnv(batch_of(Watched, 3, **RENDERED))
     task.reset(seed=[0, 1, 2])
     cameras = list_cameras(task.env)
@@ -35,12 +43,15 @@ def test_each_env_has_its_own_picture_in_the_order_of_the_requests() -> None:
         ("on_actor", "sensor", ("depth",)),
         ("beside", "sensor", ALL),
     ]
+    assert step_pictures(task, [2, 0], ()) == []
     found = step_pictures(task, [2, 0], only_depth)
+    assert rendered == ["people", "people"], "the sensors' are in the observation"
     assert [(one.camera, one.env) for one in found] == [
         (name, env) for env in (2, 0) for name in ("people", "on_actor", "beside")
     ]
     drawn = [one for env in (2, 0) for one in take_pictures(task.env, env, only_depth)]
     for mine, theirs in zip(found, drawn, strict=True):
+        assert (mine.kind, mine.env) == (theirs.kind, theirs.env)
         np.testing.assert_array_equal(mine.pose, theirs.pose)
         for modality in ALL:
             seen, wanted_ = getattr(mine, modality), getattr(theirs, modality)
@@ -52,41 +63,6 @@ def test_each_env_has_its_own_picture_in_the_order_of_the_requests() -> None:
         found[1].depth, found[4].depth
     )
     task.obs = {}
-    (rendered,) = step_pictures(task, [1], only_depth[1:2])
-    assert rendered.depth is not None and rendered.depth.dtype == np.float32 and rendered.env == 1
-    task.close()
-
-
-@pytest.mark.slow
-def test_observed_pictures_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = TaskEnv(batched("PickCube-v1", obs_mode="rgb+depth+segmentation", robot_uids="panda_wristcam"))
-    task.reset(seed=1)
-    drawn: list[str] = []
-
-    def draw(env: Any, env_index: int, requests: Any) -> Any:
-        drawn.extend(name for name, _, _ in requests)
-        return take_pictures(env, env_index, requests)
-
-    monkeypatch.setattr(module, "take_pictures", draw)
-    task.step(np.ones((task.num_envs, 8), np.float32))
-    wanted = [
-        ("hand_camera", "sensor", ALL),
-        ("render_camera", "human", ("rgb",)),
-        ("base_camera", "sensor", ALL),
-    ]
-    assert sorted(recorded_pictures(list_cameras(task.env))) == sorted(wanted)
-    every = step_pictures(task, [1, 0], wanted)  # type: ignore[arg-type]
-    assert step_pictures(task, [1, 0], ()) == []
-    for env, pictures in ((1, every[:3]), (0, every[3:])):
-        assert [picture.camera for picture in pictures] == ["hand_camera", "render_camera", "base_camera"]
-        for picture, again in zip(pictures, take_pictures(task.env, env, wanted), strict=True):  # type: ignore[arg-type]
-            assert (picture.kind, picture.env) == (again.kind, again.env)
-            np.testing.assert_array_equal(picture.pose, again.pose)
-            assert picture.depth is None or picture.depth.dtype == np.int16
-            for modality in ALL:
-                seen = getattr(picture, modality)
-                if modality == "depth" and seen is not None:
-                    seen = seen / np.float32(1000)
-                np.testing.assert_array_equal(seen, getattr(again, modality))
-    assert set(drawn) == {"render_camera"}
+    (fresh,) = step_pictures(task, [1], only_depth[1:2])
+    assert fresh.depth is not None and fresh.depth.dtype == np.float32 and fresh.env == 1
     task.close()
