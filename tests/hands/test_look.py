@@ -41,12 +41,12 @@ class Camera:
 class Page:
     """The tools of the selected body on one page, `cube` selected in env 1 of 3."""
 
-    def __init__(self, panels: Panels, monkeypatch: pytest.MonkeyPatch, body: str = "cube") -> None:
-        self.hands = Hands(panels, body)
+    def __init__(self, panels: Panels, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.panels, self.hands = panels, Hands(panels)
         self.client = SimpleNamespace(camera=Camera())
         self.camera = self.client.camera
         monkeypatch.setattr(panels.server, "get_clients", lambda: {1: self.client})
-        self.part = BodyView(panels.server, lambda: body, lambda: self.hands.panel.selected, 1.0)
+        self.part = BodyView(panels.server, lambda: "cube", lambda: self.hands.panel.selected, 1.0)
         self.draw(self.hands.poses)
 
     def draw(self, poses: np.ndarray) -> None:
@@ -62,10 +62,12 @@ class Page:
         return poses
 
 
-def test_a_hidden_body_is_left_out_of_the_view_in_all_envs_until_it_is_shown(
-    panels: Panels, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = Page(panels, monkeypatch)
+@pytest.fixture
+def page(panels: Panels, monkeypatch: pytest.MonkeyPatch) -> Page:
+    return Page(panels, monkeypatch)
+
+
+def test_a_hidden_body_is_left_out_of_the_view_in_all_envs_until_it_is_shown(page: Page) -> None:
     geometry, poses = page.hands.geometry, page.hands.poses
     cube = geometry.body_names.index("cube")
     page.do(HideBody())
@@ -80,10 +82,7 @@ def test_a_hidden_body_is_left_out_of_the_view_in_all_envs_until_it_is_shown(
     np.testing.assert_array_equal(page.part.without_hidden(geometry, poses), poses)
 
 
-def test_the_viewpoint_follows_the_body_but_not_to_another_env(
-    panels: Panels, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = Page(panels, monkeypatch)
+def test_the_viewpoint_follows_the_body_but_not_to_another_env(page: Page) -> None:
     page.draw(page.moved([0.1, 0, 0]))
     np.testing.assert_array_equal(page.camera.position, [6, 0, 1])
     page.do(TrackBody())
@@ -101,10 +100,7 @@ def test_the_viewpoint_follows_the_body_but_not_to_another_env(
     np.testing.assert_allclose(page.camera.position, [6.2, 0, 1.2], atol=1e-6)
 
 
-def test_the_centre_of_mass_and_the_joint_are_drawn_in_the_frame_of_the_turned_body(
-    panels: Panels, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = Page(panels, monkeypatch)
+def test_the_centre_of_mass_and_the_joint_are_drawn_in_the_frame_of_the_turned_body(page: Page) -> None:
     poses = page.moved([0.1, 0.2, 0.3])
     # A quarter turn about z: x of the body is y of the env.
     poses[1, page.hands.geometry.body_names.index("cube"), 3:] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
@@ -119,7 +115,7 @@ def test_the_centre_of_mass_and_the_joint_are_drawn_in_the_frame_of_the_turned_b
     def drawn(read: BodyReadings | None) -> tuple[list, list]:
         page.hands.panel.draw_in_view(page.hands.view, poses, OFFSET)
         page.part.draw_in_view(page.hands.view, poses, OFFSET, read)
-        return panels.nodes("/hands/mass"), panels.nodes("/hands/joint_axis")
+        return page.panels.nodes("/hands/mass"), page.panels.nodes("/hands/joint_axis")
 
     (mass,), (axis,) = drawn(of_cube)
     np.testing.assert_allclose(mass.position, place + [0, 0.02, 0.01], atol=1e-6)
@@ -147,10 +143,7 @@ def test_the_measured_line_joins_the_bodies_of_the_selected_env(live_page: Live)
     np.testing.assert_allclose(drawn.batched_positions[-1], end, atol=1e-6)
 
 
-def test_framing_looks_at_the_body_from_where_the_user_stands(
-    panels: Panels, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = Page(panels, monkeypatch)
+def test_framing_looks_at_the_body_from_where_the_user_stands(page: Page) -> None:
     direction = page.camera.position - page.camera.look_at
     page.do(FrameBody())
     np.testing.assert_allclose(page.camera.look_at, page.hands.pose[:3] + OFFSET, atol=1e-5)

@@ -13,7 +13,7 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
-from tests.drive.session import fake_worker_session, live_session, wait_until
+from tests.drive.session import FakeWorkerSession, live_session, wait_until
 from workbench.hands.commands import ResetUntil, StopResetUntil
 from workbench.hands.reset_until import (
     MAX_RESETS,
@@ -71,66 +71,65 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return effects
 
 
-def test_the_env_in_front_is_preferred_and_the_run_pauses(tmp_path: Path, begun: list[Any]) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        fake.session.do(ChoosePauseEntry(entry="success"))
-        fake.session.do(PlayRun())
-        fake.session.change(selected_env=1)
-        fake.session.do(ResetUntil())
-        fake.asked(Reset)
-        fake.session.happen(ResetTried(3, 3, ()))
-        assert fake.view.of(ResetSearch).tried == 3 and not fake.asked(Reset)
-        fake.session.happen(ResetTried(6, 3, (0, 1)))
-        assert fake.view.of(ResetSearch).state == "found"
-        assert (fake.view.seed, fake.view.selected_env) == (6, 1)
-        assert fake.worker.sent.count(Reset(None, 6)) == 1 and not fake.asked(Play)[-1].playing
-        fake.session.do(ResetUntil())
-        assert begun[-1].seeds[0] == 9
+def test_the_env_in_front_is_preferred_and_the_run_pauses(fake: FakeWorkerSession, begun: list[Any]) -> None:
+    fake.load()
+    fake.session.do(ChoosePauseEntry(entry="success"))
+    fake.session.do(PlayRun())
+    fake.session.change(selected_env=1)
+    fake.session.do(ResetUntil())
+    fake.asked(Reset)
+    fake.session.happen(ResetTried(3, 3, ()))
+    assert fake.view.of(ResetSearch).tried == 3 and not fake.asked(Reset)
+    fake.session.happen(ResetTried(6, 3, (0, 1)))
+    assert fake.view.of(ResetSearch).state == "found"
+    assert (fake.view.seed, fake.view.selected_env) == (6, 1)
+    assert fake.worker.sent.count(Reset(None, 6)) == 1 and not fake.asked(Play)[-1].playing
+    fake.session.do(ResetUntil())
+    assert begun[-1].seeds[0] == 9
 
 
-def test_a_search_is_bounded_stops_and_goes_on_where_it_stopped(tmp_path: Path, begun: list[Any]) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        fake.session.do(ChoosePauseEntry(entry="success"))
-        fake.session.do(ResetUntil())
-        (search,) = begun
-        assert isinstance(search, BeginSearch) and search.seeds[:2] == range(3, 9, 3)
-        fake.session.happen(ResetTried(3, 3, ()))
-        fake.session.do(StopResetUntil())
-        assert EndSearch() in begun
-        fake.session.happen(ResetTried(6, 3, (0,)))
-        assert fake.view.of(ResetSearch).state == "stopped" and fake.view.seed == 0
-        fake.session.do(ResetUntil())
-        assert begun[-1].seeds[0] == 6
-        for seed in begun[-1].seeds:
-            fake.session.happen(ResetTried(seed, 3, ()))
-        assert fake.view.of(ResetSearch).state == "not found"
-        fake.session.do(ResetUntil())
-        fake.load("patched")
-        assert fake.view.of(ResetSearch).state == "stopped", "the code has changed"
+def test_a_search_is_bounded_stops_and_goes_on_where_it_stopped(
+    fake: FakeWorkerSession, begun: list[Any]
+) -> None:
+    fake.load()
+    fake.session.do(ChoosePauseEntry(entry="success"))
+    fake.session.do(ResetUntil())
+    (search,) = begun
+    assert isinstance(search, BeginSearch) and search.seeds[:2] == range(3, 9, 3)
+    fake.session.happen(ResetTried(3, 3, ()))
+    fake.session.do(StopResetUntil())
+    assert EndSearch() in begun
+    fake.session.happen(ResetTried(6, 3, (0,)))
+    assert fake.view.of(ResetSearch).state == "stopped" and fake.view.seed == 0
+    fake.session.do(ResetUntil())
+    assert begun[-1].seeds[0] == 6
+    for seed in begun[-1].seeds:
+        fake.session.happen(ResetTried(seed, 3, ()))
+    assert fake.view.of(ResetSearch).state == "not found"
+    fake.session.do(ResetUntil())
+    fake.load("patched")
+    assert fake.view.of(ResetSearch).state == "stopped", "the code has changed"
 
 
 def test_another_condition_begins_at_the_present_seed_and_a_failure_is_told(
-    tmp_path: Path, begun: list[Any]
+    fake: FakeWorkerSession, begun: list[Any]
 ) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        fake.session.do(ChoosePauseEntry(entry="success"))
-        fake.session.do(ResetUntil())
-        assert len(begun[-1].seeds) == MAX_RESETS and fake.view.of(ResetSearch).total == 3 * MAX_RESETS
-        fake.session.happen(ResetTried(30, 3, ()))
-        fake.session.do(StopResetUntil())
-        fake.session.do(ChoosePauseTest(test="becomes false"))
-        fake.session.do(ResetUntil())
-        assert begun[-1].seeds[0] == 3 and fake.view.of(ResetSearch).tried == 0
-        fake.session.happen(SearchFailed("the task raised", None))
-        failed = fake.view.of(ResetSearch)
-        assert (failed.state, failed.why) == ("failed", "the task raised")
-        fake.session.happen(ResetTried(33, 3, (0,)))
-        assert fake.view.of(ResetSearch) == failed
-        fake.load("patched")
-        assert fake.view.of(ResetSearch) == ResetSearch()
+    fake.load()
+    fake.session.do(ChoosePauseEntry(entry="success"))
+    fake.session.do(ResetUntil())
+    assert len(begun[-1].seeds) == MAX_RESETS and fake.view.of(ResetSearch).total == 3 * MAX_RESETS
+    fake.session.happen(ResetTried(30, 3, ()))
+    fake.session.do(StopResetUntil())
+    fake.session.do(ChoosePauseTest(test="becomes false"))
+    fake.session.do(ResetUntil())
+    assert begun[-1].seeds[0] == 3 and fake.view.of(ResetSearch).tried == 0
+    fake.session.happen(SearchFailed("the task raised", None))
+    failed = fake.view.of(ResetSearch)
+    assert (failed.state, failed.why) == ("failed", "the task raised")
+    fake.session.happen(ResetTried(33, 3, (0,)))
+    assert fake.view.of(ResetSearch) == failed
+    fake.load("patched")
+    assert fake.view.of(ResetSearch) == ResetSearch()
 
 
 def test_the_result_of_another_condition_is_not_shown(panels: Panels) -> None:
@@ -143,17 +142,16 @@ def test_the_result_of_another_condition_is_not_shown(panels: Panels) -> None:
         assert ("Seed 6, env 1" in panels.html("reset_until")) == shown
 
 
-def test_no_condition_and_a_reward_are_refused(tmp_path: Path, begun: list[Any]) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        with pytest.raises(Refused):
-            fake.session.do(ResetUntil())
-        fake.load()
-        with pytest.raises(Refused):
-            fake.session.do(ResetUntil())
-        fake.session.do(ChoosePauseEntry(entry="reward"))
-        with pytest.raises(Refused):
-            fake.session.do(ResetUntil())
-        assert not begun
+def test_no_condition_and_a_reward_are_refused(fake: FakeWorkerSession, begun: list[Any]) -> None:
+    with pytest.raises(Refused):
+        fake.session.do(ResetUntil())
+    fake.load()
+    with pytest.raises(Refused):
+        fake.session.do(ResetUntil())
+    fake.session.do(ChoosePauseEntry(entry="reward"))
+    with pytest.raises(Refused):
+        fake.session.do(ResetUntil())
+    assert not begun
 
 
 def test_the_button_is_there_with_a_condition_and_stops_a_running_search(panels: Panels) -> None:

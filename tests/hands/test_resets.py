@@ -15,7 +15,7 @@ import pytest
 from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import running
-from tests.drive.session import fake_worker_session, live_session, start_over, wait_until
+from tests.drive.session import FakeWorkerSession, live_session, start_over, wait_until
 from workbench.envs.inspection import Overlap
 from workbench.hands.commands import HideResets, SampleResets, ShowReset, ToggleGhosts
 from workbench.hands.panel import HandsPanel
@@ -95,37 +95,33 @@ def test_overlaps_and_bodies_out_of_reach_are_found_in_their_envs(
 
 
 def test_a_new_version_is_sampled_again_and_late_results_are_dropped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fake: FakeWorkerSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        with pytest.raises(Refused):
-            fake.session.do(SampleResets())
-        fake.load()
-        begun: list[object] = []
-        monkeypatch.setattr(
-            "workbench.hands.resets.ResetJobs.perform", lambda _, effect: begun.append(effect)
-        )
+    with pytest.raises(Refused):
         fake.session.do(SampleResets())
-        states = FirstStates(fake.view.step.poses)
-        fake.session.happen(ResetSampled(0, states))
-        assert fake.view.of(ResetCloud).seeds == (0,)
-        fake.load("patched")
-        assert fake.view.of(ResetCloud).seeds == () and len(begun) == 2
-        fake.session.do(HideResets())
-        fake.session.happen(ResetSampled(0, states))
-        assert fake.view.of(ResetCloud) == replace(ResetCloud(), serial=fake.view.of(ResetCloud).serial)
+    fake.load()
+    begun: list[object] = []
+    monkeypatch.setattr("workbench.hands.resets.ResetJobs.perform", lambda _, effect: begun.append(effect))
+    fake.session.do(SampleResets())
+    states = FirstStates(fake.view.step.poses)
+    fake.session.happen(ResetSampled(0, states))
+    assert fake.view.of(ResetCloud).seeds == (0,)
+    fake.load("patched")
+    assert fake.view.of(ResetCloud).seeds == () and len(begun) == 2
+    fake.session.do(HideResets())
+    fake.session.happen(ResetSampled(0, states))
+    assert fake.view.of(ResetCloud) == replace(ResetCloud(), serial=fake.view.of(ResetCloud).serial)
 
 
-def test_a_sampled_reset_is_shown_in_its_env_with_its_seed(tmp_path: Path) -> None:
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        fake.asked(Reset)
-        with pytest.raises(Refused):
-            fake.session.do(ShowReset(seed=6, env=3))
-        assert not fake.asked(Reset)
-        fake.session.do(ShowReset(seed=6, env=2))
-        assert fake.view.selected_env == 2 and fake.view.seed == 6
-        assert fake.asked(Reset) == [Reset(None, 6)]
+def test_a_sampled_reset_is_shown_in_its_env_with_its_seed(fake: FakeWorkerSession) -> None:
+    fake.load()
+    fake.asked(Reset)
+    with pytest.raises(Refused):
+        fake.session.do(ShowReset(seed=6, env=3))
+    assert not fake.asked(Reset)
+    fake.session.do(ShowReset(seed=6, env=2))
+    assert fake.view.selected_env == 2 and fake.view.seed == 6
+    assert fake.asked(Reset) == [Reset(None, 6)]
 
 
 @pytest.fixture
@@ -239,26 +235,25 @@ def test_what_the_resets_of_each_body_came_to_is_told_by_pairs_envs_and_bins() -
 
 
 def test_sampling_ends_after_its_batches_or_with_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fake: FakeWorkerSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[Any] = []
     monkeypatch.setattr("workbench.hands.resets.ResetJobs.perform", lambda _, effect: begun.append(effect))
-    with fake_worker_session(tmp_path) as fake:
-        fake.load()
-        fake.session.do(SetSeed(seed=100))
-        for _ in range(2):
-            fake.session.do(SampleResets())
-            seeds = begun[-1].seeds
-            assert seeds == tuple(range(100, 100 + 3 * len(seeds), 3)) and 3 * (
-                len(seeds) - 1
-            ) < MIN_EPISODES <= 3 * len(seeds)
-            serials = []
-            for seed in seeds:
-                assert fake.view.of(ResetCloud).state == "running"
-                fake.session.happen(ResetSampled(seed, FirstStates(fake.view.step.poses)))
-                serials.append(fake.view.of(ResetCloud).serial)
-            cloud = fake.view.of(ResetCloud)
-            assert cloud.state == "done" and cloud.seeds == seeds and len(set(serials)) == len(seeds)
+    fake.load()
+    fake.session.do(SetSeed(seed=100))
+    for _ in range(2):
         fake.session.do(SampleResets())
-        fake.session.happen(SamplingFailed("it raised", None))
-        assert (fake.view.of(ResetCloud).state, fake.view.of(ResetCloud).why) == ("failed", "it raised")
+        seeds = begun[-1].seeds
+        assert seeds == tuple(range(100, 100 + 3 * len(seeds), 3)) and 3 * (
+            len(seeds) - 1
+        ) < MIN_EPISODES <= 3 * len(seeds)
+        serials = []
+        for seed in seeds:
+            assert fake.view.of(ResetCloud).state == "running"
+            fake.session.happen(ResetSampled(seed, FirstStates(fake.view.step.poses)))
+            serials.append(fake.view.of(ResetCloud).serial)
+        cloud = fake.view.of(ResetCloud)
+        assert cloud.state == "done" and cloud.seeds == seeds and len(set(serials)) == len(seeds)
+    fake.session.do(SampleResets())
+    fake.session.happen(SamplingFailed("it raised", None))
+    assert (fake.view.of(ResetCloud).state, fake.view.of(ResetCloud).why) == ("failed", "it raised")
