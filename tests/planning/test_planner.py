@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,12 +14,14 @@ import pytest
 import torch
 
 import workbench
+from tests.drive.render_device import RENDER_BACKEND
 from tests.planning.walking import MADE, SMALL, walk
 from workbench.envs.action_vector import action_parts, hold_action
 from workbench.envs.maniskill_private import open_env
 from workbench.envs.snapshots.cpu_state import CpuState
 from workbench.planning.rollouts import NotAlike
 
+Planned = Callable[..., tuple[Any, workbench.Planner]]
 TASKS = Path(__file__).parents[2] / "tasks"
 TASK_SOURCE = '''
 """Rewards a rising hand; `trouble` adds NaN rewards, an early failure or random rewards."""
@@ -73,6 +76,23 @@ def push() -> Iterator[tuple[Any, workbench.Planner]]:
     env.close()
 
 
+@pytest.fixture
+def planned() -> Iterator[Planned]:
+    """Makes an env and its planner, which are closed after the test; keywords are those of `workbench.make`."""
+    with ExitStack() as closed:
+
+        def make(
+            task: str | Path, num_envs: int = 1, options: dict[str, Any] = SMALL, **more: Any
+        ) -> tuple[Any, workbench.Planner]:
+            env = workbench.make(task, num_envs, **{**MADE, **more})
+            closed.callback(env.close)
+            planner = workbench.Planner(env, **options)
+            closed.callback(planner.close)
+            return env, planner
+
+        yield make
+
+
 def test_plans_do_not_depend_on_earlier_plans(
     push: tuple[Any, workbench.Planner],
 ) -> None:
@@ -84,16 +104,12 @@ def test_plans_do_not_depend_on_earlier_plans(
     assert not np.array_equal(first[:, 0], first[:, 1])
 
 
-def test_an_envs_plan_does_not_depend_on_the_batch(push: tuple[Any, workbench.Planner]) -> None:
+def test_an_envs_plan_does_not_depend_on_the_batch(
+    push: tuple[Any, workbench.Planner], planned: Planned
+) -> None:
     env, planner = push
     together = walk(env, planner, None)
-    alone = workbench.make("PushCube-v1", 1, **MADE)
-    np.testing.assert_array_equal(walk(alone, planner_of(alone), None)[:, 0], together[:, 0])
-    alone.close()
-
-
-def planner_of(env: Any) -> workbench.Planner:
-    return workbench.Planner(env, **SMALL)
+    np.testing.assert_array_equal(walk(*planned("PushCube-v1"), None)[:, 0], together[:, 0])
 
 
 @pytest.mark.slow
@@ -143,9 +159,8 @@ def test_actions_stay_within_the_space(push: tuple[Any, workbench.Planner]) -> N
     assert (taken >= space.low).all() and (taken <= space.high).all()
 
 
-def test_every_sets_how_many_actions_of_each_envs_plan_are_taken(task: Path) -> None:
-    env = workbench.make(task, 2, **MADE)
-    planner = workbench.Planner(env, every=3, **SMALL)
+def test_every_sets_how_many_actions_of_each_envs_plan_are_taken(task: Path, planned: Planned) -> None:
+    env, planner = planned(task, 2, {"every": 3, **SMALL})
     env.reset(seed=0)
     plans, taken = [], [(0, 0), (1, 1), (2, 0), (0, 1)]
     for turn, numbers in enumerate(taken):
@@ -159,14 +174,13 @@ def test_every_sets_how_many_actions_of_each_envs_plan_are_taken(task: Path) -> 
     for number, first in enumerate(([True, True, True, False], [True, True, False, False])):
         assert [each[number] is plans[0][number] for each in plans] == first
     assert plans[2][1] is plans[3][1]
-    planner.close()
-    env.close()
 
 
 @pytest.mark.parametrize("trouble", [pytest.param("nan", marks=pytest.mark.slow), "fail"])
-def test_a_rollout_earns_nothing_after_a_fail_and_ranks_worst_with_nan(task: Path, trouble: str) -> None:
-    env = workbench.make(task, 1, trouble=trouble, **MADE)
-    planner = workbench.Planner(env, rollouts=32, horizon=0.5)
+def test_a_rollout_earns_nothing_after_a_fail_and_ranks_worst_with_nan(
+    task: Path, planned: Planned, trouble: str
+) -> None:
+    env, planner = planned(task, 1, {"rollouts": 32, "horizon": 0.5}, trouble=trouble)
     env.reset(seed=0)
     troubled = 0
     for _ in range(8):
@@ -187,23 +201,18 @@ def test_a_rollout_earns_nothing_after_a_fail_and_ranks_worst_with_nan(task: Pat
             np.testing.assert_allclose(plan.terms["height"], plan.returns, rtol=1e-5)
     assert float(info["height"]) < 0.2
     assert troubled
-    planner.close()
-    env.close()
 
 
-def test_random_draws_of_a_tasks_step_are_repeatable(task: Path) -> None:
-    env = workbench.make(task, 1, trouble="noise", **MADE)
-    planner = planner_of(env)
+def test_random_draws_of_a_tasks_step_are_repeatable(task: Path, planned: Planned) -> None:
+    env, planner = planned(task, trouble="noise")
     first = walk(env, planner, None, steps=2)
     torch.manual_seed(99)
     assert np.array_equal(first[0], walk(env, planner, None, steps=2)[0])
-    planner.close()
-    env.close()
 
 
-def test_rollouts_of_an_env_with_picture_observations_render_nothing() -> None:
-    env: Any = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb", control_mode="pd_joint_pos")
-    planner = planner_of(env)
+def test_rollouts_of_an_env_with_picture_observations_render_nothing(planned: Planned) -> None:
+    pictured = {"obs_mode": "rgb", "control_mode": "pd_joint_pos", "render_backend": RENDER_BACKEND}
+    env, planner = planned("PushCube-v1", **pictured)
     rolled = planner.rollout_env
     assert rolled.obs_mode == "state_dict" and not rolled.scene.can_render()
     assert rolled.control_mode == "pd_joint_pos" and planner.horizon == 4
@@ -216,39 +225,28 @@ def test_rollouts_of_an_env_with_picture_observations_render_nothing() -> None:
     )
     assert 0.003 < away.max() < 0.05
     env.step(planner.actions())
-    planner.close()
-    env.close()
 
 
-def test_a_task_whose_bodies_differ_by_env_is_refused_with_their_name() -> None:
-    env = workbench.make(TASKS / "different_objects.py", 4, backend="cpu", render_backend="none")
-    planner = planner_of(env)
+def test_a_task_whose_bodies_differ_by_env_is_refused_with_their_name(planned: Planned) -> None:
+    env, planner = planned(TASKS / "different_objects.py", 4, control_mode=None)
     env.reset(seed=0)
     with pytest.raises(NotAlike, match="object"):
         planner.actions()
-    planner.close()
-    env.close()
 
 
-def test_bodies_that_a_rebuild_changes_are_compared_again(task: Path) -> None:
-    env = workbench.make(task, 1, backend="cpu", render_backend="none")
-    planner = planner_of(env)
+def test_bodies_that_a_rebuild_changes_are_compared_again(task: Path, planned: Planned) -> None:
+    env, planner = planned(task, control_mode=None)
     env.reset(seed=0)
     planner.actions()
     cast(Any, env.unwrapped).cube_half_size = 0.05
     env.reset(seed=0, options={"reconfigure": True})
     with pytest.raises(NotAlike, match="cube"):
         planner.actions()
-    planner.close()
-    env.close()
 
 
-def test_several_robots_get_a_dict_of_actions() -> None:
-    env = workbench.make(TASKS / "two_robots.py", 1, backend="cpu", render_backend="none")
-    planner = planner_of(env)
+def test_several_robots_get_a_dict_of_actions(planned: Planned) -> None:
+    env, planner = planned(TASKS / "two_robots.py", control_mode=None)
     env.reset(seed=0)
     action = planner.actions()
     assert isinstance(action, dict) and len(action) == 2
     env.step(action)
-    planner.close()
-    env.close()
