@@ -5,7 +5,8 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,10 +81,21 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def tab(child_process: None, server: viser.ViserServer, folder: Path) -> Iterator[Tab]:
-    tab = Tab(server, folder)
-    yield tab
-    tab.library.close()
+def open_tab(child_process: None, server: viser.ViserServer, folder: Path) -> Iterator[Callable[[], Tab]]:
+    """Opens the tab on the folder as it is then."""
+    with ExitStack() as closed:
+
+        def open_() -> Tab:
+            tab = Tab(server, folder)
+            closed.callback(tab.library.close)
+            return tab
+
+        yield open_
+
+
+@pytest.fixture
+def tab(open_tab: Callable[[], Tab]) -> Tab:
+    return open_tab()
 
 
 def test_points_are_listed_best_first_and_can_be_sorted_by_any_column(tab: Tab) -> None:
@@ -124,13 +136,10 @@ def test_a_value_of_an_axis_filters_the_points(tab: Tab) -> None:
 
 
 def test_sorting_and_filtering_return_to_the_first_page(
-    child_process: None,
-    server: viser.ViserServer,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    open_tab: Callable[[], Tab], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep, "PAGE_ROWS", 2)
-    tab = Tab(server, folder)
+    tab = open_tab()
     for command in (
         SortSweep(column="set reach_weight"),
         FilterSweep(name="robot_uids", value='"fetch"'),
@@ -140,7 +149,6 @@ def test_sorting_and_filtering_return_to_the_first_page(
         assert "3 to" in tab.panels.html("wb-sweep-scroll")
         tab.ask(command)
         assert "1 to 2 of" in tab.panels.html("wb-sweep-scroll"), command
-    tab.library.close()
 
 
 def test_the_open_episodes_point_is_shown_until_another_is_chosen(tab: Tab) -> None:
@@ -178,49 +186,41 @@ HOSTILE = SweepResults(
 )
 
 
-def test_hostile_results_are_escaped_and_open_nothing(
-    child_process: None, server: viser.ViserServer, folder: Path
-) -> None:
+def test_hostile_results_are_escaped_and_open_nothing(open_tab: Callable[[], Tab], folder: Path) -> None:
     write_results(folder / RESULTS, HOSTILE)
     table = pq.read_table(folder / RESULTS)
     about = json.loads(table.schema.metadata[b"workbench.sweep"]) | {"points": HOSTILE_POINTS}
     table = table.replace_schema_metadata({b"workbench.sweep": json.dumps(about).encode()})
     pq.write_table(table, folder / RESULTS)
-    tab = Tab(server, folder)
+    tab = open_tab()
     shown = "".join(handle.content for handle in tab.panels.htmls())
     assert "<img src=x" not in shown and "\u202e" not in shown and html.escape("<img src=x") in shown
     assert max(map(len, re.findall(r"\S+", shown))) < 1000
     assert "inf" not in tab.panels.html("wb-parallel").lower() and "nan" not in tab.panels.html("wb-parallel")
     assert "Its recording is not in this folder" in tab.panels.html("wb-sweep-episodes")
     assert name_of(OpenSweepEpisode) not in tab.panels.html("wb-sweep-episodes")
-    tab.library.close()
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 nonsense PAR1"])
 def test_an_unreadable_results_file_is_reported(
-    child_process: None, server: viser.ViserServer, folder: Path, content: bytes
+    open_tab: Callable[[], Tab], folder: Path, content: bytes
 ) -> None:
     (folder / RESULTS).write_bytes(content)
-    tab = Tab(server, folder)
+    tab = open_tab()
     assert (
         "results.parquet cannot be read" in tab.panels.html("wb-note")
         and tab.panels.html("wb-parallel") == ""
     )
-    tab.library.close()
 
 
 def test_a_link_to_results_elsewhere_is_not_followed(
-    child_process: None,
-    server: viser.ViserServer,
-    folder: Path,
-    tmp_path_factory: pytest.TempPathFactory,
+    open_tab: Callable[[], Tab], folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     elsewhere = tmp_path_factory.mktemp("elsewhere") / "secret.parquet"
     (folder / RESULTS).rename(elsewhere)
     (folder / RESULTS).symlink_to(elsewhere)
-    tab = Tab(server, folder)
+    tab = open_tab()
     assert tab.points() == [] and "denied" in tab.panels.html("wb-note").lower()
-    tab.library.close()
 
 
 def test_earlier_success_ranks_first_then_higher_return() -> None:
