@@ -15,8 +15,11 @@ import pytest
 from tests.drive.session import DEATH, FakeWorkerSession, fake_worker_session, moment
 from workbench.envs.robots import Joint, JointTarget, RobotDescription, RobotKeyframe, RobotLink
 from workbench.hands.commands import (
+    BeginAgain,
     ChooseMovedEnvs,
+    DiscardEpisode,
     DragJoint,
+    KeepEpisode,
     SetJoint,
     ToggleDriving,
     ToggleReach,
@@ -122,6 +125,7 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
         assert not fake.asked(MoveJoints | MoveBody | PullBody | ReachPose | SetSliderAction)  # type: ignore[arg-type]
 
     refuse(
+        *(KeepEpisode(), DiscardEpisode(), BeginAgain()),
         SetJoint(robot="left", joint=2, to=0.0),
         SetJoint(robot="middle", joint=0, to=0.0),
         WriteQpos("middle"),
@@ -148,6 +152,7 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
     load(fake, "rebuilt", actions=(), robots=(), arms=())
     fake.reset()
     before = hands(fake)
+    assert before.reach == Reach(), "there is no arm"
     refuse(ToggleDriving(), ToggleReach(), WriteQpos("left"))
     load(fake, "rebuilt", actions=ABSOLUTE)
     fake.reset()

@@ -69,14 +69,7 @@ def test_each_joint_has_a_slider_with_its_unit_and_limits(live_page: Live) -> No
     assert "0 to 0.5 m" in run.html("wb-field-slider") and "no limits, °" in run.html("wb-field-slider")
 
 
-def test_the_sliders_of_several_robots_are_named_by_the_robot(live_page: Live) -> None:
-    other = replace(ARM, name="other")
-    run = unfold(live_page, view_of(ARM, other))
-    assert f"{TITLE} \N{MIDDLE DOT} 2 robots" in live_page.folders()
-    assert "<b>arm</b>" in run.html() and "<b>other</b>" in run.html()
-
-
-def test_the_texts_to_copy_are_those_of_each_robot_in_the_selected_env(live_page: Live) -> None:
+def test_each_of_several_robots_is_named_with_its_texts_to_copy_in_the_selected_env(live_page: Live) -> None:
     wrist = RobotDescription(
         "other", (Joint("wrist", True, 0.0, 1.0, 1),), (RobotLink(HAND, -1, -1, HERE, HERE),)
     )
@@ -85,14 +78,17 @@ def test_the_texts_to_copy_are_those_of_each_robot_in_the_selected_env(live_page
     poses = view.step.poses.copy()
     poses[:, :, 0] = np.arange(3)[:, None] + np.arange(poses.shape[1]) / 8
     run = unfold(live_page, replace(view, step=replace(view.step, poses=poses)))
+    assert f"{TITLE} \N{MIDDLE DOT} 2 robots" in live_page.folders()
     html = unescape(run.html())
-    for code in (
+    for text in (
+        "<b>arm</b>",
+        "<b>other</b>",
         qpos_code([math.pi, 0.2]),
         keyframe_code([math.pi, 0.2], poses[1, 0]),
         qpos_code([0.2]),
         keyframe_code([0.2], poses[1, HAND]),
     ):
-        assert code in html
+        assert text in html
 
 
 @pytest.mark.parametrize(

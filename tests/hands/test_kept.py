@@ -255,9 +255,3 @@ def test_what_a_hand_moved_is_told_when_the_episode_is_kept(driven: Session) -> 
     driven.do(KeepEpisode())
     assert "by hand" in driven.view().of(Hands).note
     wait_until(driven, lambda v: v.of(RecordingStatus).kept.saved > before.saved, "the files")
-
-
-def test_a_person_who_does_not_drive_keeps_nothing(session: Session) -> None:
-    for command in (KeepEpisode(), DiscardEpisode(), BeginAgain()):
-        with pytest.raises(Refused, match="Drive first"):
-            session.do(command)

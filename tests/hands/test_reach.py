@@ -6,25 +6,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.drive.scenes import running
 from tests.drive.session import jump, live_session, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.hands.commands import SetJoint, ToggleDriving, ToggleReach
-from workbench.hands.reach import ArmDragged, Reach, loaded
+from workbench.hands.reach import ArmDragged, Reach
 from workbench.hands.state import Hands
 from workbench.live.commands import PauseRun, PlayRun, UseControlMode
 from workbench.live.history.moments import BY_HAND
-from workbench.live.messages import Settings
-from workbench.live.run import first_run
 from workbench.live.timeline_commands import UndoReset
 from workbench.live.view import SessionView
 from workbench.page.command import Refused
-from workbench.task.description import TaskOptions
 
 ARM = "panda/panda_hand_tcp"
 WAY = np.array([0.05, 0.06, -0.05, 0, 0, 0, 0])
@@ -148,11 +143,6 @@ def test_why_a_move_fell_short_is_shown_until_the_reset(session: Session) -> Non
     assert reach(session).reached[KEY].why
     start_over(session, 1)
     assert not reach(session).reached
-
-
-def test_without_an_arm_another_task_has_no_handles() -> None:
-    run = replace(first_run("push.py", TaskOptions(), 1, Settings()), task=running(1).task)
-    assert loaded(Reach(shown=True), run) == Reach()
 
 
 def test_a_robot_without_an_arm_is_refused_in_words(

@@ -117,12 +117,6 @@ def run_as(class_name: str) -> RunHooks:
     return lambda sources: run_class(sources, class_name)
 
 
-def key_of(source: str, uid: str = "cam") -> CameraKey:
-    """Return the key of the only camera named `uid`."""
-    ((hook, _),) = [key for key in real_configs({FILE: source}) if key[1] == uid]
-    return KINDS[hook], uid
-
-
 def looking(eye: Sequence[float], target: Sequence[float]) -> tuple[float, float, float, float]:
     """Return the orientation of ManiSkill's own look_at, normalized."""
     return unit(sapien_utils.look_at(list(eye), list(target)).raw_pose[0, 3:].tolist())
