@@ -13,18 +13,9 @@ from tests.drive.waiting import until
 from workbench.episodes.episode import Episode
 from workbench.live.effects import Asked
 from workbench.page.command import Command
-from workbench.review.commands import (
-    CloseRecording,
-    SelectRecording,
-)
+from workbench.review.commands import CloseRecording, SelectRecording
 from workbench.review.playback import Review
-from workbench.review.state import (
-    FileStamp,
-    ReadingEnded,
-    RecordingRead,
-    ReviewState,
-    apply,
-)
+from workbench.review.state import FileStamp, ReadingEnded, RecordingRead, ReviewState, apply
 from workbench.review.view import Opened, ReviewView, find_events
 
 
@@ -108,12 +99,6 @@ def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) 
     )
 
 
-LENGTHS = (10, 12, 6)
-
-
-SUCCESSES = (4, 7, None)
-
-
 def recording(name: str, steps: int, success_from: int | None = None, minute: int = 0) -> Opened:
     """The reset, and the first success, are its events."""
     written = f"2024-01-01T00:{minute:02}:00+00:00"
@@ -129,10 +114,8 @@ def with_opened(*opened: Opened) -> ReviewState:
 
 
 def three() -> ReviewState:
-    rows = zip("abc", LENGTHS, SUCCESSES, strict=True)
-    return with_opened(
-        *(recording(name, steps, success, at) for at, (name, steps, success) in enumerate(rows))
-    )
+    """Recordings of 10, 12 and 6 steps, successful from state 4, from state 7 and never."""
+    return with_opened(recording("a", 10, 4, 0), recording("b", 12, 7, 1), recording("c", 6, None, 2))
 
 
 def after(state: ReviewState, *commands: Command, now: float = 0.0) -> ReviewState:

@@ -32,15 +32,6 @@ def test_the_first_body_that_moves_elsewhere_and_when() -> None:
     assert parts_at(difference(a, b, (0, 0), tolerance=0.1)) == 8
 
 
-def test_recordings_are_compared_as_aligned() -> None:
-    """The same motion, starting three states later, is equal once both are aligned at it."""
-    a, b = made(10), made(13)
-    poses_of(b)[:, BODY["cube"], 0] = np.maximum(np.arange(14) - 3, 0) * 0.01
-    assert parts_at(difference(a, b, (0, 0))) == 1
-    found = difference(a, b, (0, 3))
-    assert parts_at(found) is None and (found.begin, found.compared) == (0, 11)
-
-
 def test_different_bodies_lengths_and_entries_are_reported() -> None:
     a, b = made(10), made(4)
     b.geometry = replace(geometry_of(b), body_names=("ground", "table", "arm/hand", "box"), visuals=())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,101 +21,22 @@ from workbench.episodes.row import UnreadableRecording
 from workbench.library.folder import Library
 from workbench.live.commands import TogglePlay
 from workbench.live.messages import CameraRequest
-from workbench.live.timeline_commands import NextEvent, PreviousEvent, Seek, StepForward
-from workbench.page.command import Refused
 from workbench.review.commands import (
-    AlignRecordings,
-    ChoosePlaybackSpeed,
-    LoopPlayback,
     OpenAgain,
-    SwapWithFirst,
 )
 from workbench.review.panel import facts_html
 from workbench.review.playback import Review
-from workbench.review.view import Opened, PictureReader, column_at, curves, find_events
+from workbench.review.view import Opened, PictureReader, column_at
 
 
-def test_playback_runs_at_the_control_rate_and_stops_at_the_end() -> None:
+def test_playback_runs_by_the_clock() -> None:
     review, library = review_of(a=made(10))
-    assert opened(review, "a").last == 10
+    opened(review, "a")
     review.do(TogglePlay())
     library.now += 0.26
-    assert review.view().position == 5 and review.view().playing
-    review.do(ChoosePlaybackSpeed(speed=2.0))
-    library.now += 0.11
-    assert review.view().position == 9
+    assert (review.view().position, review.view().playing) == (5, True)
     library.now += 10
-    view = review.view()
-    assert view.position == 10 and not view.playing
-    review.do(TogglePlay())
-    assert review.view().position == 0, "playing from the end restarts"
-    review.do(LoopPlayback(on=True))
-    library.now += 0.05 * 11 / 2 + 1e-3
-    assert review.view().position == 0 and review.view().playing
-
-
-def test_stepping_goes_frame_by_frame_and_from_event_to_event() -> None:
-    review, _ = review_of(a=made(10, success_from=7))
-    opened(review, "a")
-    review.do(StepForward())
-    assert review.view().position == 1
-    review.do(NextEvent())
-    assert review.view().position == 7
-    review.do(NextEvent())
-    assert review.view().position == 10, "the last jump goes to the end"
-    review.do(PreviousEvent())
-    review.do(PreviousEvent())
-    assert review.view().position == 0
-    review.do(Seek(step=10**9))
-    assert review.view().position == 10
-
-
-def test_when_aligned_each_recording_shows_its_own_state_of_the_event() -> None:
-    review, _ = review_of(a=made(10, success_from=7), b=made(6, success_from=2), c=made(4))
-    view = opened(review, "a", "b", "c")
-    assert view.states == (0, 0, 0)
-    review.do(Seek(step=5))
-    review.do(AlignRecordings(at="first success"))
-    view = review.view()
-    assert view.states == (5, 0, 0), "the selected recording keeps its state"
-    assert (view.first, view.last) == (-7, 4)
-    review.do(Seek(step=0))
-    assert review.view().states == (7, 2, 0)
-    review.do(Seek(step=2))
-    assert review.view().states == (9, 4, 2)
-    with pytest.raises(Refused, match="align"):
-        review.do(AlignRecordings(at="first kiss"))
-    close_one(review, 0)
-    assert [o.id for o in review.view().opened] == ["b", "c"]
-    assert review.view().align == "first success"
-    close_one(review, 0)
-    close_one(review, 0)
-    assert review.view().opened == () and review.view().states == ()
-    review.do(TogglePlay())
-    review.do(StepForward())
-    review.do(NextEvent())
-
-
-def test_the_older_recording_comes_first_and_two_can_be_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "workbench.review.state.FIRST_SHOWN_SECONDS", 0.0
-    )  # the first is shown before the other is read
-    review, _ = review_of(
-        new=made(4, written_at="2026-11-22T10:00:00+00:00"),
-        old=made(6, written_at="2026-11-21T10:00:00+00:00"),
-    )
-    review.open(["new", "old"])
-    view = reach(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
-    assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
-    select(review, 1)
-    review.do(Seek(step=3))
-    review.do(SwapWithFirst(index=1))
-    view = review.view()
-    assert [one.id for one in view.opened] == ["new", "old"]
-    assert view.chosen is not None and view.chosen.id == "new" and view.states == (3, 3)
-    with pytest.raises(Refused):
-        review.do(SwapWithFirst(index=7))
-    assert [one.id for one in review.view().opened] == ["new", "old"]
+    assert (review.view().position, review.view().playing) == (10, False)
 
 
 def test_unreadable_recordings_are_reported_and_the_others_open() -> None:
@@ -224,99 +144,47 @@ def test_changes_of_the_selected_recordings_task_are_reported_at_once_and_after_
     review.close()
 
 
-@pytest.fixture
-def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
+def test_the_newest_recording_is_opened_beside_the_library_once_listed_and_only_once(
+    child_process: None, tmp_path: Path
+) -> None:
     for seed, minute in ((1, 10), (2, 20), (3, 15)):
         write(tmp_path, made(3, seed=seed, written_at=f"2026-11-22T10:{minute}:00+00:00"), pictures=False)
     library = Library(tmp_path)
-    yield library
-    library.close()
-
-
-def test_the_newest_recording_is_opened_beside_the_library_once_listed_and_only_once(filled: Library) -> None:
-    review = Review(filled)
-    filled.on_change.add(review.library_changed)
+    review = Review(library)
+    library.on_change.add(review.library_changed)
     review.open_first("newest")
     review.add_problem("A killed program left half an episode.")
     assert not review.view().loading
-    filled.refresh()
+    library.refresh()
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the newest")
     assert [one.episode.info.seed for one in view.opened] == [2] and view.library_stays
     assert view.problems == ("A killed program left half an episode.",), (
         "a person had no chance to read it yet"
     )
     close_one(review, 0)
-    write(filled.folder, made(3, seed=4), pictures=False)
-    filled.refresh()
+    write(tmp_path, made(3, seed=4), pictures=False)
+    library.refresh()
     assert not review.view().loading and not review.view().opened
     review.close()
-
-
-def test_a_file_is_opened_beside_the_library_once_listed(filled: Library) -> None:
-    filled.refresh()
-    review = Review(filled)
-    filled.on_change.add(review.library_changed)
-    review.open_first("newest")
-    later = write(filled.folder, made(3, seed=4, written_at="2026-11-22T10:00:00+00:00"), pictures=False)
-    review.open_first(later.with_suffix(".rrd"))
-    reach(review, lambda view: not view.loading, "the second request")
-    filled.refresh()
-    view = reach(review, lambda v: [o.episode.info.seed for o in v.opened] == [4], "the file")
-    assert view.library_stays
-    review.close()
-
-
-def test_nothing_is_opened_automatically_after_a_person_has_opened_a_recording(
-    filled: Library, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    elsewhere = write(tmp_path_factory.mktemp("other"), made(3, seed=4), pictures=False)
-    filled.refresh()
-    review = Review(filled)
-    filled.on_change.add(review.library_changed)
-    review.open_first(filled.folder / elsewhere.name)
-    (row,) = (row for row in filled.view().rows if row.seed == 1)
-    view = opened(review, row.id)
-    assert not view.library_stays
-    for file in elsewhere.parent.glob(f"{elsewhere.stem}.*"):
-        file.rename(filled.folder / file.name)
-    filled.refresh()
-    assert len(filled.view().rows) == 4
-    assert [one.id for one in review.view().opened] == [row.id] and not review.view().loading
-    review.close()
+    library.close()
 
 
 def test_the_first_recordings_are_shown_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
-    review, library = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
-    reached, go_on = threading.Event(), threading.Event()
+    library = FakeLibrary({id: made(10) for id in "abc"})
+    go_on = threading.Event()
 
     def read(row: Row, *_: object) -> Episode:
-        if row.id == "d":
-            reached.set()
-            assert go_on.wait(60)
+        assert row.id != "c" or go_on.wait(60)
         return library.read(row)
 
     review = Review(library, read, clock=library.clock)  # type: ignore[arg-type]
-    review.open("abcde", state=4)
-    assert reached.wait(60)
-    view = reach(review, lambda view: len(view.opened) == 3, "the first three")
-    assert view.loading == "opening 4 of 5: file d" and view.position == 4
-    select(review, 1)
-    review.do(Seek(step=15))
-    review.do(TogglePlay())
-    close_one(review, 0)
-    view = review.view()
-    assert [o.id for o in view.opened] == ["b", "c"] and view.selected == 0
-    review.do(Seek(step=15))
-    review.do(TogglePlay())
+    review.open("abc", state=4)
+    view = reach(review, lambda view: len(view.opened) == 2, "the first two")
+    assert view.loading == "opening 3 of 3: file c" and view.position == 4
     go_on.set()
-    view = reach(review, lambda view: not view.loading, "the others")
-    assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "a closed recording does not come back"
-    assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
-    assert "first success" in view.alignments
-    review.open("ab")
-    view = reach(review, lambda view: not view.loading, "both")
-    assert [o.id for o in view.opened] == ["a", "b"], "a closed recording can be opened again"
+    view = reach(review, lambda view: not view.loading, "the last")
+    assert [o.id for o in view.opened] == ["a", "b", "c"]
 
 
 def test_another_opening_ends_one_that_has_already_shown_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -400,17 +268,6 @@ def test_what_is_known_of_a_recording_is_among_its_facts() -> None:
     for field_name, (value, shown) in known.items():
         assert shown not in facts() and shown in facts(**{field_name: value}), field_name
     assert "and evaluate" in facts("and evaluate")
-
-
-def test_events_of_an_episode_are_where_an_entry_becomes_true() -> None:
-    episode = made(10, success_from=4)
-    episode.evaluate["grasped"] = np.array([0, 0, 1, 1, 0, 0, 1, 0, 0, 0, np.nan])
-    episode.reward[8] = np.nan
-    found = [(h.state, h.name) for h in find_events(episode)]
-    assert found[:4] == [(0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped")]
-    assert [state for state, _ in found[4:]] == [9], "the NaN reward"
-    states, values = curves(episode)["reward"]["reward"]
-    assert (states[0], values[0]) == (1, 1)
 
 
 @given(

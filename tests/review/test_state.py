@@ -103,8 +103,9 @@ def test_recordings_are_selected_in_turn_and_the_position_stays() -> None:
     [("a", "b", "a"), ("b", "a", "b"), ("b", "b", "c"), ("c", "c", "b"), ("c", "a", "c")],
 )
 def test_closing_a_recording_keeps_the_selected_one(selected: str, closed: str, left: str) -> None:
-    state = after(three(), review.SelectRecording(id=selected), review.CloseRecording(id=closed))
+    state = after(three(), SUCCESS, review.SelectRecording(id=selected), review.CloseRecording(id=closed))
     assert state.view.chosen is not None and state.view.chosen.id == left
+    assert state.view.align == "first success"
     assert [one.id for one in state.view.opened] == [one for one in "abc" if one != closed]
     assert state.view.opened_serial > three().view.opened_serial
 
@@ -214,13 +215,15 @@ def test_the_first_recordings_are_shown_while_others_are_read_and_nothing_moves_
         shown.append([one.id for one in state.view.opened])
     assert shown == [[], ["b", "a"], ["b", "a"]], "the pause doubles"
     assert state.view.position == 2 and state.files == files
-    state = after(state, review.CloseRecording(id="b"), timeline.Seek(step=5), now=1.3)
+    slowly = review.ChoosePlaybackSpeed(speed=0.1)
+    state = after(state, review.CloseRecording(id="b"), timeline.Seek(step=5), slowly, TogglePlay(), now=1.3)
     assert [one.id for one in state.view.opened] == ["a"]
     state, _ = apply(state, RecordingNotRead(begun.opening, "d", "d is broken"), 1.4)
     state, _ = apply(state, ReadingEnded(begun.opening, "too much memory"), 1.5)
     view = state.view
     assert [one.id for one in view.opened] == ["a", "c"], "in the order of time, without the closed one"
     assert (view.position, view.loading, view.not_opened) == (5, "", ("d",)) and view.chosen is view.opened[0]
+    assert view.playing
     assert view.problems == ("d is broken", "too much memory") == state.problems
     state, again = opening(state, Asked(review.OpenAgain()))
     assert again is not None and [one.id for one in again.rows] == ["a", "c", "d"]
@@ -253,17 +256,21 @@ def test_the_first_recording_is_opened_once_it_is_listed_and_readable() -> None:
     assert begun is not None and [one.id for one in begun.rows] == ["new"] and state.view.library_stays
     _, begun = opening(state, listed(rows))
     assert begun is None
+    state, _ = opening(ReviewState(), OpenFirst("newest"))
     for rows, wanted in (
         ([row("a")], None),
         ([row("a"), row("b", problem="no")], None),
         ([row("a"), row("b")], "b"),
     ):
-        state, _ = opening(ReviewState(), OpenFirst(Path("elsewhere/b.json")))
-        _, begun = opening(state, listed(rows, reading="1 of 2"))
+        later, _ = opening(state, OpenFirst(Path("elsewhere/b.json")))
+        _, begun = opening(later, listed(rows, reading="1 of 2"))
         assert (None if begun is None else begun.rows[0].id) == wanted
-    state, _ = opening(ReviewState(), OpenFirst("newest"))
-    state, begun = opening(state, listed([row("bad", problem="no")]))
-    assert begun is None and state.first is None
+    bad, begun = opening(state, listed([row("bad", problem="no")]))
+    assert begun is None and bad.first is None
+    state, _ = apply(state, listed([row("a")], reading="1 of 2"), 0.0)
+    state, _ = opening(state, Open(("a",)))
+    state, begun = opening(state, listed([row("a"), row("new", 5)]))
+    assert begun is None, "a person has opened another one"
 
 
 def test_a_check_of_files_is_of_the_open_files_and_of_the_selected_task() -> None:
