@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import re
 import threading
@@ -17,7 +16,7 @@ import pytest
 from PIL import Image
 
 from tests.drive.waiting import TIMEOUT_SECONDS, until
-from workbench.machine.loop import do, result_of
+from workbench.machine.loop import result_of
 from workbench.start import catalogue as catalogue_module
 from workbench.start import registered as registered_module
 from workbench.start.catalogue import Catalogue, Entry, Section
@@ -57,6 +56,15 @@ def made(tmp_path: Path) -> Iterator[Callable[..., Catalogue]]:
         one.close()
 
 
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """One entry for each search of the folder."""
+    searches, find = list[int](), catalogue_module.find_task_files
+    counted = lambda *given: (searches.append(1), find(*given))[1]  # noqa: E731
+    monkeypatch.setattr(catalogue_module, "find_task_files", counted)
+    return searches
+
+
 def rows_of(catalogue: Catalogue) -> dict[Section, list[Entry]]:
     rows = catalogue.view().entries
     return {section: [one for one in rows if one.section is section] for section in Section}
@@ -73,21 +81,9 @@ def listed(catalogue: Catalogue, *in_folder: str) -> dict[Section, list[Entry]]:
     return rows_of(catalogue)
 
 
-def test_all_sections_are_listed_with_what_they_open(made: Callable[..., Catalogue], tmp_path: Path) -> None:
-    catalogue = made()
-    (tmp_path / "work/sub").mkdir()
-    (tmp_path / "work/sub/push.py").write_text(f"@register_env('Push-v1')\n{TASK}")
-    catalogue.recents.add(str(tmp_path / "work/sub/push.py"), TaskOptions(8, env_kwargs={"size": 2}))
-    catalogue.recents.add(str(tmp_path / "gone.py:Task"), TaskOptions())
-    rows = listed(catalogue, "sub/push.py")
-    gone, recent = rows[Section.RECENT]
-    assert gone.gone and gone.name == "gone.py:Task" and not recent.gone
-    assert "sub/" in recent.about and "8 envs" in recent.about and "size=2" in recent.about
-    assert recent.options == TaskOptions(8, env_kwargs={"size": 2})
-    (in_folder,) = rows[Section.FOLDER]
-    assert (in_folder.name, in_folder.about) == ("sub/push.py", "Push-v1") and in_folder.options is None
+def test_the_examples_and_maniskills_tasks_are_listed(made: Callable[..., Catalogue]) -> None:
+    rows = listed(made())
     assert {"minimal.py", "push_cube.py"} <= {one.name for one in rows[Section.EXAMPLES]}
-    assert [one.reference for one in rows[Section.RECORDINGS]] == [""]
     (pick,) = rows[Section.REGISTERED]
     assert (pick.reference, pick.file, pick.blank) == ("PickCube-v1", None, "needs a download")
 
@@ -112,7 +108,7 @@ def test_only_a_listed_number_is_an_entry_and_numbers_are_not_reused(
 
 
 def test_the_list_follows_its_folder_and_is_unchanged_without_changes(
-    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: Callable[..., Catalogue], searches: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(catalogue_module, "SEARCH_SECONDS", 0.02)
     catalogue = made()
@@ -137,26 +133,16 @@ def test_the_list_follows_its_folder_and_is_unchanged_without_changes(
     (work / "pull.py").unlink()
     comes_to("shove.py: Task")
     until(lambda: not catalogue.registered.view.doing, "the ids")
-    searches: list[int] = []
-    find = catalogue_module.find_task_files
-    monkeypatch.setattr(
-        catalogue_module, "find_task_files", lambda *given: (searches.append(1), find(*given))[1]
-    )
-    view = catalogue.view()
-    until(lambda: catalogue.view() and len(searches) > 2, "further searches")
+    view, before = catalogue.view(), len(searches)
+    until(lambda: catalogue.view() and len(searches) > before + 2, "further searches")
     assert catalogue.view() is view
 
 
 def test_a_list_that_is_not_shown_does_not_follow_its_folder(
-    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: Callable[..., Catalogue], searches: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(catalogue_module, "SEARCH_SECONDS", 0.01)
     monkeypatch.setattr(catalogue_module, "SHOWN_SECONDS", 0.05)
-    searches: list[int] = []
-    find = catalogue_module.find_task_files
-    monkeypatch.setattr(
-        catalogue_module, "find_task_files", lambda *given: (searches.append(1), find(*given))[1]
-    )
     catalogue = made()
     assert not catalogue.view().entries, "there is no search before a request"
     catalogue.refresh()
@@ -269,99 +255,3 @@ def test_a_cached_thumbnail_is_shown_and_an_invalid_one_is_not(
     assert catalogue.registered.picture("Good-v1") == jpeg()
     for name in ("Bad-v1", "Secret-v1", "../cache/Good-v1", "Good-v1.jpg", ""):
         assert catalogue.registered.picture(name) is None
-
-
-@pytest.mark.slow
-def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_path: Path) -> None:
-    first = RegisteredTasks(folder=tmp_path)
-    first.start()
-    first.start()
-    # The first tasks lack a download on most machines; this is not shown as broken.
-    until(lambda: first.view.pictures or first.view.problem, "a picture", 280, lambda: first.view)
-    view = first.view
-    first.close()
-    assert "PickCube-v1" in view.ids and not view.problem
-    drawn = next(iter(view.pictures))
-    picture = Image.open(io.BytesIO(first.picture(drawn) or b""))
-    assert picture.size == (registered_module.WIDTH_PIXELS, registered_module.HEIGHT_PIXELS)
-    assert np.asarray(picture).std() > 5, "the picture is not empty"
-    again = RegisteredTasks(lambda: False, folder=tmp_path)
-    again.start()
-    until(lambda: again.view.pictures, "the cached one")
-    again.close()
-    assert again.view.ids == view.ids and again.view.why_not.keys() >= view.why_not.keys()
-
-
-class Process:
-    """Replaces the process that draws the thumbnails."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(registered_module, "Background", self.made)
-        self.asked: list[str] = []
-        self.ended = self.closed = 0
-
-    def made(self, niceness: int) -> Process:
-        assert niceness == 19
-        return self
-
-    def end(self) -> None:
-        self.ended += 1
-
-    def close(self) -> None:
-        self.closed += 1
-
-    async def ask(self, question: registered_module.DrawTask) -> object:
-        self.asked.append(question.env_id)
-        return await self.answer()
-
-    async def answer(self) -> object:
-        raise registered_module.JobFailed("it crashed")
-
-
-class Hanging(Process):
-    async def answer(self) -> object:
-        await asyncio.Event().wait()
-
-
-def test_a_task_that_cannot_be_drawn_is_not_retried_forever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    process = Process(monkeypatch)
-    cached(tmp_path, ["A-v1"], not_drawn={})
-    for _ in range(4):
-        tasks = RegisteredTasks(folder=tmp_path)
-        tasks.start()
-        until(lambda tasks=tasks: tasks.view.why_not and not tasks.view.doing, "its end")
-        tasks.close()
-        assert tasks.view.why_not["A-v1"].text == "it crashed"
-    assert process.asked == ["A-v1"] * registered_module.MAX_TRIES
-
-
-def test_a_thumbnail_that_times_out_is_omitted_and_its_process_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    process = Hanging(monkeypatch)
-    monkeypatch.setattr(registered_module, "ANSWER_SECONDS", 0.01)
-    tasks = RegisteredTasks(folder=cached(tmp_path, ["A-v1", "B-v1"], not_drawn={}))
-    tasks.start()
-    until(lambda: len(tasks.view.why_not) == 2 and not tasks.view.doing, "its end")
-    assert process.ended >= 2 and "longer than" in tasks.view.why_not["A-v1"].text
-    tasks.close()
-
-
-def test_close_stops_a_running_thumbnail_and_starts_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    process = Hanging(monkeypatch)
-    folder = cached(tmp_path, ["A-v1"], not_drawn={})
-    tasks = RegisteredTasks(folder=folder)
-    tasks.start()
-    until(lambda: process.asked, "the question")
-    tasks.close()
-    until(lambda: not tasks.view.doing, "its end")
-    assert process.closed == 1 and not tasks.view.why_not
-    never = RegisteredTasks(folder=folder)
-    never.close()
-    never.start()
-    do(lambda: None)
-    assert never.view == registered_module.RegisteredView() and process.asked == ["A-v1"]

@@ -29,7 +29,7 @@ from workbench.start.panel import (
     tasks_html,
 )
 from workbench.start.recents import RecentTasks
-from workbench.start.registered import NotDrawn, RegisteredTasks, RegisteredView
+from workbench.start.registered import RegisteredTasks
 from workbench.task.description import TaskOptions
 from workbench.task.new_task import TEMPLATES
 
@@ -43,7 +43,7 @@ class Chosen:
 
     def __init__(self, catalogue: Catalogue) -> None:
         self.catalogue, self.numbers = catalogue, list[int]()
-        self.says = ""
+        self.says, self.done = "", list[bool]()
         self.created: list[tuple[str, TemplateName]] = []
 
     def choose(self, number: int) -> None:
@@ -74,29 +74,33 @@ def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Chosen]:
     catalogue.close()
 
 
+@pytest.fixture
+def listed(panels: Panels, chosen: Chosen) -> TaskList:
+    listed = TaskList(panels.server, chosen, lambda: chosen.done.append(True))
+    panels.visitors.do = listed.do
+    return listed
+
+
 def number_of(chosen: Chosen, name: str) -> int:
     return next(one.number for one in chosen.catalogue.view().entries if one.name == name)
 
 
 def test_a_press_on_a_row_chooses_it_and_an_unlisted_number_chooses_nothing(
-    panels: Panels, chosen: Chosen
+    panels: Panels, chosen: Chosen, listed: TaskList
 ) -> None:
-    done: list[bool] = []
-    listed = TaskList(panels.server, chosen, lambda: done.append(True))
     listed.draw()
     push = number_of(chosen, "push.py")
     assert f'data-row="{push}"' in panels.html("wb-tasks")
-    panels.visitors.do = listed.do
     for number in (0, push + 500, 10**6):
         panels.do(OpenListedTask(number=number))
-    assert chosen.numbers == [] and done == [] and len(panels.client.notices) == 3
+    assert chosen.numbers == [] and chosen.done == [] and len(panels.client.notices) == 3
     panels.ask(OpenListedTask(number=push))
-    assert chosen.numbers == [push] and done == [True]
+    assert chosen.numbers == [push] and chosen.done == [True]
 
 
-def test_the_search_keeps_entries_with_all_words_and_can_be_cleared(panels: Panels, chosen: Chosen) -> None:
-    listed = TaskList(panels.server, chosen)
-    panels.visitors.do = listed.do
+def test_the_search_keeps_entries_with_all_words_and_can_be_cleared(
+    panels: Panels, chosen: Chosen, listed: TaskList
+) -> None:
     panels.type("Search", "PUSH .py")
     listed.draw()
     html = panels.html("wb-tasks")
@@ -111,9 +115,8 @@ def test_the_search_keeps_entries_with_all_words_and_can_be_cleared(panels: Pane
 
 
 def test_enter_opens_the_first_unopened_match_or_reports_that_there_is_none(
-    panels: Panels, chosen: Chosen
+    panels: Panels, chosen: Chosen, listed: TaskList
 ) -> None:
-    panels.visitors.do = TaskList(panels.server, chosen).do
     panels.type("Search", ".py")
     panels.do(OpenFoundTask())
     assert chosen.numbers == [number_of(chosen, "pull.py")]
@@ -126,10 +129,8 @@ def test_enter_opens_the_first_unopened_match_or_reports_that_there_is_none(
 
 
 def test_a_path_is_searched_and_enter_opens_the_current_match(
-    panels: Panels, chosen: Chosen, tmp_path: Path
+    panels: Panels, chosen: Chosen, listed: TaskList, tmp_path: Path
 ) -> None:
-    listed = TaskList(panels.server, chosen)
-    panels.visitors.do = listed.do
     file = tmp_path / "elsewhere" / "other.py"
 
     def html() -> str:
@@ -155,10 +156,8 @@ def test_a_path_is_searched_and_enter_opens_the_current_match(
 
 @pytest.mark.parametrize("words", ["a/\0.py", "/\x1b[31m\0", "file://[/x.py"])
 def test_words_that_are_no_valid_path_do_not_break_the_list(
-    panels: Panels, chosen: Chosen, words: str
+    panels: Panels, chosen: Chosen, listed: TaskList, words: str
 ) -> None:
-    listed = TaskList(panels.server, chosen)
-    panels.visitors.do = listed.do
     panels.type("Search", words)
     panels.do(OpenFoundTask())
     listed.draw()
@@ -173,27 +172,24 @@ def test_the_best_match_is_an_existing_file() -> None:
     assert best_row([gone], lambda row: False) == gone and best_row([], lambda row: False) is None
 
 
-def test_a_new_task_is_requested_with_name_and_template(panels: Panels, chosen: Chosen) -> None:
-    done: list[bool] = []
-    listed = TaskList(panels.server, chosen, lambda: done.append(True))
-    panels.visitors.do = listed.do
+def test_a_new_task_is_requested_with_name_and_template(
+    panels: Panels, chosen: Chosen, listed: TaskList
+) -> None:
     panels.set("Name", "taken")
     panels.press(CREATE)
     assert panels.client.notices == ["There is a file taken.py already."]
-    assert chosen.created == [] and done == []
+    assert chosen.created == [] and chosen.done == []
     panels.set("Name", " stack_two ")
     assert list(panels.field("Template").options.values()) == [one.name for one in TEMPLATES]
     panels.set("Template", next(one for one in panels.field("Template").options if "table" in one))
     panels.press(CREATE)
-    assert chosen.created == [("stack_two", "tabletop")] and done == [True]
+    assert chosen.created == [("stack_two", "tabletop")] and chosen.done == [True]
     listed.draw()
     assert panels.typed("Name") == " stack_two " and panels.field("Template").value.startswith("tabletop: ")
 
 
 @pytest.mark.parametrize("name", ["x" * 201, "a\nb", "a\0b", "\u202eyp.kcats"])
-def test_an_invalid_file_name_is_refused(panels: Panels, chosen: Chosen, name: str) -> None:
-    listed = TaskList(panels.server, chosen)
-    panels.visitors.do = listed.do
+def test_an_invalid_file_name_is_refused(panels: Panels, chosen: Chosen, listed: TaskList, name: str) -> None:
     panels.set("Name", name)
     listed.draw()
     assert len(panels.client.notices) == 1 and panels.typed("Name") == ""
@@ -206,16 +202,6 @@ def html(view: CatalogueView) -> str:
 def test_names_are_escaped_and_missing_files_are_marked() -> None:
     text = html(CatalogueView((EVIL,)))
     assert "&lt;b&gt;x.py" in text and "<script>" not in text and "gone · a &amp; b" in text
-
-
-def test_each_card_has_a_thumbnail_or_the_reason_for_none() -> None:
-    known = RegisteredView(("PickCube-v1", "Ycb-v1"), frozenset({"PickCube-v1"}), {"Ycb-v1": NotDrawn("x")})
-    ycb = Entry(
-        4, Section.REGISTERED, "Ycb-v1", "needs ycb", "Ycb-v1", env_id="Ycb-v1", blank="needs a download"
-    )
-    text = html(CatalogueView((PICK, ycb), registered=known))
-    assert 'src="/task_pictures/PickCube-v1.jpg"' in text and "needs a download" in text
-    assert 'src="/task_pictures/Ycb-v1.jpg"' not in text
 
 
 def test_the_dialog_opens_once_and_closes_on_a_choice(panels: Panels, chosen: Chosen) -> None:

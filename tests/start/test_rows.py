@@ -105,7 +105,8 @@ def test_registered_tasks_without_a_picture_come_last_with_the_reason(place: Sim
     ]
     assert all(one.env_id == one.name == one.reference and one.options is None for one in found)
     html = tasks_html(place.catalogue.view(), Search(), "")
-    assert html.count("/task_pictures/") == 1 and html.index("Good-v1") < html.index("Ycb-v1")
+    assert html.count("/task_pictures/") == html.count('src="/task_pictures/Good-v1.jpg"') == 1
+    assert html.index("Good-v1") < html.index("cannot be drawn here") < html.index("needs a download")
 
 
 def test_files_of_the_folder_name_their_tasks_and_recordings_say_whether_there_are_any(
