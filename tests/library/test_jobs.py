@@ -72,16 +72,6 @@ def test_jobs_of_subfolders_are_listed_with_their_path(tmp_path: Path, child_pro
         library.close()
 
 
-def test_progress_is_written_once_a_second_and_the_end_at_once(tmp_path: Path) -> None:
-    now = 1e9
-    file = StatusFile(tmp_path, lambda: now)
-    for done in range(5):
-        file.write(JobStatus("record", "my_task.py", done, 100))
-    assert read_jobs(tmp_path, now)[0].done == 0
-    file.write(JobStatus("record", "my_task.py", 4, 100, state="stopped"))
-    assert read_jobs(tmp_path, now)[0].state == "stopped"
-
-
 def test_a_resumed_job_replaces_only_its_own_last_status(tmp_path: Path) -> None:
     now = time.time()
     for status in (
