@@ -167,18 +167,6 @@ def test_panel_changes_of_a_press_are_sent_separately_from_the_view(
     assert "GuiUpdateMessage" not in view
 
 
-def test_a_single_env_has_one_instance_of_each_mesh(opened: Opened) -> None:
-    opened.load()
-    assert all(len(h.batched_positions) == 3 for h in opened.panels.bodies("panda_hand"))
-    opened.panels.do(ToggleOnlySelected())
-    opened.draw()
-    hand = opened.panels.bodies("panda_hand")[0]
-    assert hand.batched_positions.shape == (1, 3)
-    assert opened.panels.labels() == []
-    opened.panels.do(ToggleOnlySelected())
-    opened.draw()
-
-
 def test_a_broken_file_is_reported_and_the_scene_stays(opened: Opened, task_file: Path) -> None:
     good = task_file.read_text(encoding="utf-8")
     opened.load()

@@ -13,7 +13,6 @@ from tests.drive.scenes import camera as camera_info
 from tests.drive.scripted import scripted
 from tests.drive.session import camera, hold_saving, moved, wait_until
 from tests.drive.waiting import until
-from workbench.app import shared
 from workbench.app.open_task import Choices
 from workbench.app.server import App
 from workbench.app.session import KeptWork, Session
@@ -21,7 +20,7 @@ from workbench.cameras.commands import UndoCamera
 from workbench.cameras.events import CameraChosen, CameraPlaced
 from workbench.cameras.view import StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
-from workbench.live.commands import PauseRun, PlayRun, Step
+from workbench.live.commands import Step
 from workbench.live.process.background_jobs import JobProgress
 from workbench.machine.loop import do, result_of
 from workbench.page.door.gated_server import GatedServer
@@ -143,7 +142,7 @@ def test_a_reopened_task_has_its_selections_and_camera_edits(desk: Desk) -> None
     desk.choose("pull.py")
     second = desk.session_of("pull.py")
     assert not moved(second.view()) and second.view().selected_env == 0
-    until(lambda: first._changes._closing, "the end of the first session")
+    desk.idle()
     desk.choose("push.py")
     again = desk.session_of("push.py")
     assert again is not first
@@ -241,22 +240,6 @@ def test_the_recordings_have_a_row_and_a_task_can_be_opened_from_there(
     desk.choose("push.py")
     desk.session_of("push.py")
     until(lambda: desk.app.shared.pages.shown == "live", "the page")
-
-
-def test_the_machine_is_idle_for_thumbnails_only_while_no_task_is_working(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shared, "MIN_FREE_BYTES", 0)
-    assert desk.app.shared.is_idle()
-    desk.choose("push.py")
-    session = desk.session_of("push.py")
-    until(desk.app.shared.is_idle, "a paused task")
-    session.do(PlayRun())
-    until(lambda: not desk.app.shared.is_idle(), "a task that plays")
-    session.do(PauseRun())
-    until(desk.app.shared.is_idle, "a paused task")
-    monkeypatch.setattr(shared, "MIN_FREE_BYTES", 1 << 60)
-    assert not desk.app.shared.is_idle()
 
 
 def test_a_new_task_is_written_to_the_start_folder_and_opened(desk: Desk) -> None:

@@ -17,11 +17,9 @@ from tests.drive.panels import Panels, held_by
 from tests.drive.session import wait_until
 from tests.drive.tabs import tabs_of
 from tests.drive.waiting import until
-from workbench.app.pages import ShownPage, Which
 from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import PlayRun
-from workbench.page.commands import ToggleTable
 from workbench.page.door.gated_server import GatedServer
 from workbench.task.description import TaskOptions
 
@@ -106,32 +104,6 @@ def test_an_episode_whose_writer_was_killed_is_recovered_and_reported(
         until(lambda: [row.seed for row in app.shared.recordings.library.view().rows] == [8], "its row")
     finally:
         app.close()
-
-
-def test_a_press_while_another_page_is_built_is_refused(
-    app: App, panels: Panels, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    panels.come_to(app.shared.visitors)
-    app.shared.pages.start("review")
-    building, go_on = threading.Event(), threading.Event()
-    make = app.shared.pages._make
-
-    def slow(which: Which, dark: bool) -> ShownPage:
-        building.set()
-        assert go_on.wait(60)
-        return make(which, dark)
-
-    monkeypatch.setattr(app.shared.pages, "_make", slow)
-    shown = app.shared.pages.show("live")
-    try:
-        assert building.wait(60)
-        panels.do(ToggleTable())
-        assert len(panels.client.notices) == 1
-    finally:
-        go_on.set()
-    shown.result(60)
-    panels.do(ToggleTable())
-    assert len(panels.client.notices) == 1
 
 
 @pytest.mark.slow

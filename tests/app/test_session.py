@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -79,13 +78,9 @@ def test_the_counter_of_changes_counts_only_changes(tmp_path: Path) -> None:
         assert session.wait(before, 0.0) != before
 
 
-def test_events_and_lines_are_handed_on(tmp_path: Path) -> None:
+def test_events_are_handed_on(tmp_path: Path) -> None:
     events: list[Event] = []
-    lines: list[str] = []
-    with opened(tmp_path, on_event=events.append, on_line=lambda line: lines.append(line.text)) as (
-        fake,
-        worker,
-    ):
+    with opened(tmp_path, on_event=events.append) as (fake, worker):
         fake.load()
         assert worker.deaths_reset == 1 and len(events) == 1
         fake.tell(TaskFailed(problem(), kept=True))
@@ -101,7 +96,6 @@ def test_events_and_lines_are_handed_on(tmp_path: Path) -> None:
         assert isinstance(events[-1], TaskFailed) and events[-1].kept and events[-1].problem.stage == "worker"
         fake.session.do(Interrupt())
         assert worker.interrupts == 1
-        logging.getLogger("workbench").info("nothing")
     with opened(tmp_path, on_event=events.append) as (fake, _):
         fake.die()
         assert isinstance(events[-1], TaskFailed) and not events[-1].kept, "there is no version to return to"
@@ -150,9 +144,7 @@ def test_each_entered_recording_has_its_own_number(tmp_path: Path) -> None:
         ]
 
 
-def test_an_effect_that_fails_costs_only_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_effect_that_fails_costs_only_itself(tmp_path: Path) -> None:
     with opened(tmp_path) as (fake, _):
         fake.load()
         fake.asked(object)

@@ -17,10 +17,11 @@ from tests.drive.scenes import running
 from tests.drive.waiting import until
 from workbench.app import pages as module
 from workbench.app import recording_problems, shared
-from workbench.app.pages import FRAME_SECONDS, Pages, next_frame
+from workbench.app.pages import Pages
 from workbench.app.recording_problems import RecordingProblems
 from workbench.app.shared import Shared
 from workbench.live.process.heartbeat import Busy
+from workbench.page.command import Refused
 from workbench.page.door.gated_server import GatedServer
 from workbench.page.widgets.visitors import Visitor
 from workbench.record.saving_state import KeptEpisodes, SaveStatus, Saving
@@ -66,6 +67,8 @@ class House:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.visitors, self.cleared, self.breaks = 1, 0, False
+        self.building, self.may_build = threading.Event(), threading.Event()
+        self.may_build.set()
         self.made: list[Shown] = []
         stage: Any = SimpleNamespace(framing=SimpleNamespace(follow=lambda: self.visitors), clear=self._clear)
         self.pages = Pages(server, stage, cast(Any, self._make))
@@ -74,6 +77,8 @@ class House:
         self.cleared += 1
 
     def _make(self, which: str, dark: bool) -> Shown:
+        self.building.set()
+        assert self.may_build.wait(60)
         if self.breaks:
             raise OSError("no such page")
         self.made.append(Shown(which, dark))
@@ -131,6 +136,20 @@ def test_a_page_that_cannot_be_built_is_reported_to_who_asked_and_another_can_be
     assert house.pages.shown == "start"
 
 
+def test_a_press_while_another_page_is_built_is_refused(house: House, panels: Panels) -> None:
+    command: Any = "a command"
+    house.building.clear()
+    house.may_build.clear()
+    shown = house.pages.show("review")
+    assert house.building.wait(60)
+    with pytest.raises(Refused):
+        house.pages.do(command, panels.visitor)
+    house.may_build.set()
+    shown.result(60)
+    house.pages.do(command, panels.visitor)
+    assert [command in page.asked for page in house.made] == [False, True]
+
+
 def test_a_page_without_visitors_is_not_drawn_but_knows_it(house: House) -> None:
     house.visitors = 0
     (live,) = house.made
@@ -151,14 +170,6 @@ def test_a_drawing_that_fails_is_tried_again(house: House, monkeypatch: pytest.M
     house.made[-1].serial += 1
     until(lambda: not house.made[-1].fails and house.drawings() > before, "a drawing after the failures")
     assert len(told) == 2
-
-
-def test_late_frames_do_not_add_up() -> None:
-    on_time = next_frame(10.0, 10.0)
-    assert on_time == 10.0 + FRAME_SECONDS
-    assert next_frame(10.0, 10.0 + FRAME_SECONDS / 4) == on_time, "the next wait is shorter"
-    late = 10.0 + 5 * FRAME_SECONDS
-    assert next_frame(10.0, late) == pytest.approx(late + FRAME_SECONDS / 2), "but there is always a pause"
 
 
 # --- what a recording saved ------------------------------------------------------------------------------
@@ -198,7 +209,7 @@ class StubSession:
 
 def reports(*statuses: RecordingStatus) -> list[str]:
     """The messages for the terminal about these successive statuses."""
-    session, notices = StubSession(RecordingStatus(), *statuses, statuses[-1], statuses[-1]), list[str]()
+    session, notices = StubSession(RecordingStatus(), *statuses, statuses[-1]), list[str]()
     watching = RecordingProblems(cast(Any, None), lambda: cast(Any, session), notices.append)
     until(lambda: session.is_seen, "the last status")
     watching.close()
@@ -331,6 +342,7 @@ def test_the_machine_is_idle_only_while_nothing_runs(
     view = running(1, state="paused", playing=False)
     session = SimpleNamespace(view=lambda: view)
     pages = house_of(session)
+    assert house_of().is_idle()
     for state, busy, idle in (
         ("paused", None, True),
         ("error", None, True),
@@ -341,3 +353,7 @@ def test_the_machine_is_idle_only_while_nothing_runs(
     ):
         session.view = lambda state=state, busy=busy: replace(view, state=cast(Any, state), busy=busy)
         assert pages.is_idle() is idle, (state, busy)
+    session.view = lambda: view
+    assert pages.is_idle()
+    monkeypatch.setattr(shared, "MIN_FREE_BYTES", 1 << 60)
+    assert not pages.is_idle(), "there is no memory for more"
