@@ -161,7 +161,9 @@ def test_a_page_without_visitors_is_not_drawn_but_knows_it(house: House) -> None
     until(lambda: ("counted", 2) in live.asked and house.drawings() > before, "a drawing")
 
 
-def test_a_drawing_that_fails_is_tried_again(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drawing_that_fails_is_reported_and_tried_again(
+    house: House, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(module, "RETRY_SECONDS", 0.01)
     told: list[str] = []
     monkeypatch.setattr(module, "notify_all", lambda server, title, *_: told.append(title))
@@ -169,7 +171,7 @@ def test_a_drawing_that_fails_is_tried_again(house: House, monkeypatch: pytest.M
     house.made[-1].fails = 2
     house.made[-1].serial += 1
     until(lambda: not house.made[-1].fails and house.drawings() > before, "a drawing after the failures")
-    assert len(told) == 2
+    assert len(told) == 2 and "nothing to be seen" in caplog.text
 
 
 # --- what a recording saved ------------------------------------------------------------------------------

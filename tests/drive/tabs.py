@@ -45,6 +45,14 @@ def handshake(url: str) -> tuple[str, dict[str, Any]]:
     }
 
 
+def open_channel(url: str, page: str, more: str = "") -> Connection:
+    """The command channel of the page with this name; `more` is added to its address."""
+    address, options = handshake(url)
+    del options["subprotocols"]
+    path = f"{address.rstrip('/')}{PATH}?page={page}{more}"
+    return websockets.sync.client.connect(path, proxy=None, **options)
+
+
 def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800, fov: float = 0.8) -> bytes:
     """The message that a page sends after its first frame: its viewpoint and the size of its view."""
     message = viser._messages.ViewerCameraMessage(
@@ -120,10 +128,7 @@ class Tabs:
 
     def do(self, tab: Tab, command: Command) -> dict[str, Any]:
         """Send this command; return the reply."""
-        address, options = handshake(self._url)
-        del options["subprotocols"]
-        path = f"{address.rstrip('/')}{PATH}?page={tab.name}"
-        with websockets.sync.client.connect(path, proxy=None, **options) as channel:
+        with open_channel(self._url, tab.name) as channel:
             channel.send(json.dumps({"n": 1, "do": command.encode()}))
             return json.loads(channel.recv(60))
 

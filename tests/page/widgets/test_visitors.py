@@ -13,11 +13,10 @@ from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
-from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from tests.drive.panels import Panels
-from tests.drive.tabs import Tab, Tabs, handshake, tabs_of
+from tests.drive.tabs import Tab, Tabs, open_channel, tabs_of
 from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.commands import COMMANDS
 from workbench.live.commands import SetSeed, Step, TogglePlay
@@ -61,9 +60,7 @@ class House:
         return [visitor.name for visitor in self.visitors.all()]
 
     def open(self, page: str, more: str = "") -> Connection:
-        address, how = handshake(self.gated_server.url)
-        del how["subprotocols"]
-        return connect(f"{address.rstrip('/')}{PATH}?page={page}{more}", proxy=None, **how)
+        return open_channel(self.gated_server.url, page, more)
 
 
 @pytest.fixture
@@ -181,10 +178,8 @@ def test_a_client_that_is_not_an_open_page_is_refused(house: House) -> None:
     for name in ("", "made-up", house.names()[0][:-1]):
         with house.open(name) as channel, pytest.raises(ConnectionClosed):
             channel.recv(TIMEOUT_SECONDS)
-    address, how = handshake(house.gated_server.url.replace("token=", "token=x"))
-    del how["subprotocols"]
     with pytest.raises(InvalidHandshake):
-        connect(f"{address.rstrip('/')}{PATH}?page={house.names()[0]}", proxy=None, **how)
+        open_channel(house.gated_server.url.replace("token=", "token=x"), house.names()[0])
 
 
 def test_a_page_tells_its_width_and_is_gone_once_it_has_closed(house: House) -> None:
