@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -117,17 +117,24 @@ def load(fake: FakeWorkerSession, text: str = FIRST_TEXT, **changes: Any) -> Non
     fake.load("patched", source={FILE: text}, **changes)
 
 
-def ended(fake: FakeWorkerSession) -> ChecksView:
-    until(
-        lambda: fake.view.of(ChecksView).state not in RUNNING,
-        "the end of the checks",
-        seen=lambda: fake.view.of(ChecksView),
-    )
+def shown(fake: FakeWorkerSession) -> ChecksView:
     return fake.view.of(ChecksView)
 
 
-def rules_of(view: ChecksView) -> list[str]:
-    return [result.rule for result in view.results]
+def ended(fake: FakeWorkerSession) -> ChecksView:
+    until(lambda: shown(fake).state not in RUNNING, "the end of the checks", seen=lambda: shown(fake))
+    return shown(fake)
+
+
+def check_first(fake: FakeWorkerSession, background: ScriptedBackground, *found: Finding) -> None:
+    """Load the first version, of which the check ends with these findings."""
+    background.comes_to = {one.rule: RuleResult(one.rule, "broken", (one,)) for one in found}
+    load(fake)
+    ended(fake)
+
+
+def rules_of(of: Iterable[RuleResult | Finding]) -> list[str]:
+    return [one.rule for one in of]
 
 
 def test_each_load_is_checked_group_by_group_with_the_degree_of_each_rule(
@@ -136,7 +143,7 @@ def test_each_load_is_checked_group_by_group_with_the_degree_of_each_rule(
     background.comes_to = {SECOND: broken(SECOND)}
     load(checks)
     view = ended(checks)
-    assert (view.state, view.total, rules_of(view)) == ("done", 2, [FIRST, SECOND])
+    assert (view.state, view.total, rules_of(view.results)) == ("done", 2, [FIRST, SECOND])
     assert view.findings == (finding(SECOND),)
     assert [question.group for question in background.asked] == [0, 1]
     assert background.asked[0].degrees[FIRST] == "stop" and background.asked[0].degrees[SECOND] == "warn"
@@ -176,49 +183,52 @@ def test_envs_with_other_options_are_checked_again(
 def test_findings_of_the_previous_version_stay_until_their_rule_is_checked(
     checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
-    background.comes_to = {FIRST: broken(FIRST), SECOND: broken(SECOND)}
-    load(checks)
-    ended(checks)
+    check_first(checks, background, finding(FIRST), finding(SECOND))
     background.comes_to = {SECOND: broken(SECOND)}
     background.hold()
-    checks.session.happen(FileSaved())
-    load(checks, NEXT_TEXT)
-    assert [one.rule for one in checks.view.of(ChecksView).before] == [
-        FIRST,
-        SECOND,
-    ] and checks.view.of(ChecksView).findings == ()
-    checks.session.happen(FileSaved())
-    load(checks, NEXT_TEXT + "\n")
-    both = [FIRST, SECOND]
-    assert [one.rule for one in checks.view.of(ChecksView).before] == both, "no rule was checked in between"
+    # Of the first of these versions no rule is checked.
+    for text in (NEXT_TEXT, NEXT_TEXT + "\n"):
+        checks.session.happen(FileSaved())
+        load(checks, text)
+        assert rules_of(shown(checks).before) == [FIRST, SECOND] and shown(checks).findings == ()
     background.let.release()
-    until(lambda: len(checks.view.of(ChecksView).results) == 1, "the first rule")
-    assert [one.rule for one in checks.view.of(ChecksView).before] == [SECOND]
+    until(lambda: len(shown(checks).results) == 1, "the first rule")
+    assert rules_of(shown(checks).before) == [SECOND]
     background.let.release()
     view = ended(checks)
-    assert view.before == () and [one.rule for one in view.findings] == [SECOND]
+    assert view.before == () and rules_of(view.findings) == [SECOND]
 
 
-def test_a_finding_disappears_with_its_line(
-    checks: FakeWorkerSession, background: ScriptedBackground
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param({"text": MENDED_TEXT}, id="its line is gone"),
+        pytest.param({"env_id": "Pull-v1"}, id="another task"),
+        pytest.param({"options": TaskOptions(3, rules="off")}, id="no rule is checked"),
+    ],
+)
+def test_a_finding_that_no_longer_holds_is_gone_at_once(
+    changes: dict[str, Any], checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
-    background.comes_to = {FIRST: broken(FIRST)}
-    load(checks)
-    ended(checks)
+    check_first(checks, background, finding(FIRST))
+    background.hold()
+    load(checks, **changes)
+    assert (shown(checks).before, shown(checks).results) == ((), ())
+    if "options" in changes:
+        assert shown(checks).state == "off" and len(background.asked) == 2
+
+
+@pytest.mark.parametrize(
+    "changes", [{"file": None, "line": None, "code": ""}, {"code": ""}, {"file": "/home/me/other.py"}]
+)
+def test_a_finding_whose_line_is_not_known_stays_until_its_rule_is_checked(
+    changes: dict[str, Any], checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
+    one = replace(finding(FIRST), **changes)
+    check_first(checks, background, one)
     background.hold()
     load(checks, MENDED_TEXT)
-    assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
-
-
-def test_another_task_starts_without_findings(
-    checks: FakeWorkerSession, background: ScriptedBackground
-) -> None:
-    background.comes_to = {FIRST: broken(FIRST)}
-    load(checks)
-    ended(checks)
-    background.hold()
-    load(checks, env_id="Pull-v1")
-    assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
+    assert shown(checks).before == (one,)
 
 
 def test_a_save_stops_a_check_and_results_so_far_stay(
@@ -227,13 +237,13 @@ def test_a_save_stops_a_check_and_results_so_far_stay(
     background.hold()
     load(checks)
     background.let.release()
-    until(lambda: len(checks.view.of(ChecksView).results) == 1, "the first rule")
+    until(lambda: len(shown(checks).results) == 1, "the first rule")
     checks.session.happen(FileSaved())
-    assert (checks.view.of(ChecksView).state, checks.view.of(ChecksView).stopped_by) == (
+    assert (shown(checks).state, shown(checks).stopped_by) == (
         "stopped",
         StoppedBy.SAVE,
     )
-    assert rules_of(checks.view.of(ChecksView)) == [FIRST]
+    assert rules_of(shown(checks).results) == [FIRST]
     # The same text again, or a save that could not be loaded and was undone.
     background.let = threading.Semaphore(10)
     load(checks)
@@ -265,14 +275,12 @@ def test_a_rule_that_kills_the_process_fails_and_the_others_continue(
 def test_without_automatic_checks_a_load_marks_the_findings_as_old(
     checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
-    background.comes_to = {FIRST: broken(FIRST)}
-    load(checks)
-    ended(checks)
+    check_first(checks, background, finding(FIRST))
     checks.session.do(CheckAfterSave(on=False))
     for text in (NEXT_TEXT, NEXT_TEXT + "\n"):
         load(checks, text)
-        view = checks.view.of(ChecksView)
-        assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
+        view = shown(checks)
+        assert view.state == "none" and rules_of(view.before) == [FIRST] and not view.results
     assert len(background.asked) == 2
 
 
@@ -283,7 +291,7 @@ def test_turning_automatic_checks_on_is_remembered_and_checks_at_once(
         checks.session.do(CheckNow())
     for wanted in (True, False):
         checks.session.do(CheckAfterSave(on=wanted))
-        assert kept_choices().check_after_save == wanted == checks.view.of(ChecksView).after_each_save
+        assert kept_choices().check_after_save == wanted == shown(checks).after_each_save
     load(checks)
     assert background.asked == []
     checks.session.do(CheckAfterSave(on=True))
@@ -294,10 +302,10 @@ def test_a_check_stopped_by_hand_says_so(checks: FakeWorkerSession, background: 
     background.hold()
     load(checks)
     checks.session.do(StopChecks())
-    view = checks.view.of(ChecksView)
+    view = shown(checks)
     assert (view.state, view.stopped_by) == ("stopped", StoppedBy.HAND)
     checks.session.do(StopChecks())
-    assert checks.view.of(ChecksView) == view
+    assert shown(checks) == view
 
 
 def test_rules_of_gpu_simulation_that_kill_the_process_fail_together(
@@ -327,32 +335,6 @@ def test_a_process_that_dies_again_and_again_ends_the_check_and_the_next_check_b
     checks.session.do(CheckNow())
     view = ended(checks)
     assert (view.state, view.why, view.problem, view.stopped_by) == ("done", "", None, None)
-
-
-def test_a_version_of_which_no_rule_is_checked_shows_no_finding(
-    checks: FakeWorkerSession, background: ScriptedBackground
-) -> None:
-    background.comes_to = {FIRST: broken(FIRST)}
-    load(checks)
-    ended(checks)
-    load(checks, options=TaskOptions(3, rules="off"))
-    view = checks.view.of(ChecksView)
-    assert (view.state, view.before, view.results) == ("off", (), ()) and len(background.asked) == 2
-
-
-@pytest.mark.parametrize(
-    "changes", [{"file": None, "line": None, "code": ""}, {"code": ""}, {"file": "/home/me/other.py"}]
-)
-def test_a_finding_whose_line_is_not_known_stays_until_its_rule_is_checked(
-    changes: dict[str, Any], checks: FakeWorkerSession, background: ScriptedBackground
-) -> None:
-    one = replace(finding(FIRST), **changes)
-    background.comes_to = {FIRST: RuleResult(FIRST, "broken", (one,))}
-    load(checks)
-    ended(checks)
-    background.hold()
-    load(checks, MENDED_TEXT)
-    assert checks.view.of(ChecksView).before == (one,)
 
 
 @pytest.mark.parametrize(("ahead", "priorities"), [(1e9, ["low", "low"]), (0.0, ["low", "lowest"])])
@@ -386,8 +368,8 @@ def test_the_page_sees_how_far_a_check_is_and_what_it_waits_for() -> None:
     view = seen(state.GroupBegan())
     assert (view.state, view.waits) == ("checking", False)
     view = seen(state.RuleChecked(broken(FIRST), 1.5, 58))
-    assert (view.total, view.seconds, rules_of(view)) == (58, 1.5, [FIRST])
-    assert [one.rule for one in view.before] == [SECOND]
+    assert (view.total, view.seconds, rules_of(view.results)) == (58, 1.5, [FIRST])
+    assert rules_of(view.before) == [SECOND]
     view = seen(state.GroupChecked(58, "rewards"))
     assert view.looks_at == "rewards"
     view = seen(state.RuleChecked(RuleResult(FIRST, "kept"), 2.5))
@@ -430,7 +412,7 @@ def test_a_broken_save_is_found_at_its_line_while_playing_and_a_fix_clears_it(
         task_file.write_text(text)
         wait_until(
             session,
-            lambda view: FIRST in rules_of(view.of(ChecksView)) and not found(FIRST)(view),
+            lambda view: FIRST in rules_of(view.of(ChecksView).results) and not found(FIRST)(view),
             "the rule checked anew",
         )
         assert all(one.rule != FIRST for one in session.view().of(ChecksView).before)
