@@ -48,6 +48,8 @@ def test_each_kind_of_episodes_counts_its_own_successes(example: Checkup) -> Non
         assert (
             outcome(example, "success-stays-possible", mode=mode, starts=episodes(far="0 0 0")).state == state
         )
+    lacks = outcome(example, "success-stays-possible", mode="sparse", starts=episodes(far="0 0 0"))
+    assert the_finding(lacks).code.startswith("def evaluate")
     fails_only = outcome(example, "success-stays-possible", mode="sparse", starts=episodes(fail="0 0 0"))
     assert (fails_only.state, fails_only.notes) == ("kept", ())
 
