@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,8 +17,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from workbench.machine import doctor, maniskill_installed
-from workbench.machine.doctor import DoctorFinding, chromium_version, diagnose, find_chromium, print_report
+from workbench.machine import doctor, maniskill_installed, versions
+from workbench.machine.doctor import (
+    DoctorFinding,
+    chromium_version,
+    diagnose,
+    exit_code,
+    find_chromium,
+    how_to_get_chromium,
+    print_report,
+)
 from workbench.machine.render_probe import RenderProbe
 
 GIB = 2**30
@@ -158,7 +168,7 @@ def test_a_browser_is_one_that_says_its_version(
         ("chromium", "echo install the snap"),
         ("chromium-browser", "echo Chromium 1.2.3; exit 0"),
         ("google-chrome", "echo Chrome 1.2.3.4; exit 1"),
-        ("google-chrome-stable", "echo Chrome 1.2.3.4"),
+        ("google-chrome-stable", "echo Chrome 1.2.3.4 built on Debian"),
     ):
         (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")
         (tmp_path / name).chmod(0o755)
@@ -168,6 +178,7 @@ def test_a_browser_is_one_that_says_its_version(
     assert chromium_version(str(tmp_path / "gone")) is None
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", str(tmp_path / "chromium"))
     assert find_chromium() is None, "the named one counts, or none"
+    assert str(tmp_path / "chromium") in how_to_get_chromium()
 
 
 def test_the_command_to_install_names_where_the_workbench_came_from(
@@ -192,3 +203,62 @@ def test_the_command_to_install_names_where_the_workbench_came_from(
     assert maniskill_installed.command_to_install("mani_skill-nightly").endswith(
         "'maniskill-workbench[nightly]'"
     )
+
+
+# --- this machine ---------------------------------------------------------------------------------------
+
+TOPICS = {
+    *("Python", "packages", "ManiSkill", "render device", "CUDA", "GPU physics", "cores, memory", "page"),
+    *("browser (tests)", "reading"),
+}
+
+
+@pytest.mark.slow
+def test_every_topic_has_a_finding_with_versions_and_this_machine_passes(child_process: None) -> None:
+    findings = {finding.topic: finding for finding in diagnose()}
+    assert findings.keys() == TOPICS
+    assert exit_code(list(findings.values())) == 0, findings
+    assert all(finding.advice for finding in findings.values() if finding.ok is not True)
+    for name in ("viser", "torch", "numpy"):
+        assert f"{name} {versions.installed(name)}" in findings["packages"].what
+    maniskill = versions.maniskill()
+    assert maniskill is not None and maniskill[1] in findings["ManiSkill"].what
+
+
+def test_failed_and_timed_out_checks_are_reported_and_the_others_run(
+    child_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise OSError("no such thing")
+
+    monkeypatch.setattr(doctor.psutil, "virtual_memory", fail)
+    monkeypatch.setattr(doctor, "CHILD_TIMEOUT_SECONDS", 0.1)
+    for questions in ("GPU_SCRIPT", "VERSION_SCRIPT"):
+        monkeypatch.setattr(doctor, questions, "import time; time.sleep(60)")
+    monkeypatch.setattr(
+        versions.importlib.metadata, "requires", lambda name: ["viser<1", "no-such-package>=2"]
+    )
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        monkeypatch.setattr(doctor, "DEFAULT_PORT", listener.getsockname()[1])
+        began = time.monotonic()
+        findings = {finding.topic: finding for finding in diagnose()}
+    assert time.monotonic() - began < 50 and findings.keys() >= {"CUDA", "ManiSkill"}
+    for topic, fact in (("CUDA", "0.1 s"), ("ManiSkill", "0.1 s"), ("cores, memory", "no such thing")):
+        assert findings[topic].ok is not True and fact in findings[topic].what
+    packages, page = findings["packages"], findings["page"]
+    assert packages.ok is False and "viser<1" in packages.what and "no-such-package>=2" in packages.what
+    assert "pip install" in (packages.advice or "") and "'viser<1' 'no-such-package>=2'" in (
+        packages.advice or ""
+    )
+    assert page.ok is None and "--port" in (page.advice or "")
+    assert findings["Python"].ok and exit_code(list(findings.values())) == 1
+
+
+def test_the_report_shows_advice_and_prints_brackets_literally() -> None:
+    printed = io.StringIO()
+    lack = DoctorFinding("render device", False, "found [none]", "Type: apt install [this]")
+    print_report([DoctorFinding("Python", True, "3.11"), lack], Console(file=printed, width=60))
+    assert "found [none]" in printed.getvalue() and "Type: apt install [this]" in printed.getvalue()
+    assert exit_code([lack]) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from workbench.machine.loop import (
     on_loop,
     post,
     result_of,
+    submit,
     wait_for_disk,
 )
 from workbench.machine.processes.watched_thread import listen, stop_listening
@@ -139,6 +141,20 @@ def test_blocking_calls_run_one_after_the_other_and_end_with_their_results() -> 
     assert order == [0, 1, 4] and calls[4].result(0) == 4
     assert isinstance(calls[2].exception(0), OSError)
     assert do(lambda: pool.begin(lambda: call(6))).cancelled() and 6 not in order
+
+
+def test_a_pool_that_is_closed_while_its_first_call_begins_runs_or_cancels_that_call() -> None:
+    """As when the session ends just after a save began."""
+
+    async def begin(pool: BlockingPool) -> Future[int]:
+        return pool.begin(lambda: 1)
+
+    for _ in range(300):
+        pool = BlockingPool("test")
+        began = submit(begin(pool))
+        pool.close()
+        call = began.result(TIMEOUT_SECONDS)
+        assert call.cancelled() or call.result(TIMEOUT_SECONDS) == 1
 
 
 def test_a_page_waits_until_the_count_differs_or_all_ends() -> None:

@@ -1,14 +1,12 @@
 from __future__ import annotations
 
 import json
-import os
 import stat
 from pathlib import Path
 
 import pytest
 
 from workbench.machine.render_probe import probe_render_device
-from workbench.machine.software_vulkan import ensure_render_device
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -44,26 +42,6 @@ def test_a_driver_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest.Mon
     probe = probe_render_device(timeout_s=0.5)
     assert not probe.ok
     assert probe.error and "no answer" in probe.error
-
-
-def test_a_driver_that_the_user_chose_is_not_replaced(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
-    monkeypatch.setenv("PATH", str(tmp_path))  # without apt-get, an attempt to install would fail
-    probe = ensure_render_device(install=True)
-    assert not probe.ok
-    assert probe.error and "unset it" in probe.error
-
-
-def test_nothing_is_installed_if_a_device_renders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    called = tmp_path / "called"
-    apt = tmp_path / "apt-get"
-    apt.write_text(f"#!/bin/sh\ntouch {called}\n")
-    apt.chmod(apt.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert ensure_render_device(install=True).ok
-    assert not called.exists()
 
 
 def _replace_python(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:

@@ -15,32 +15,11 @@ from workbench.machine.text import only_colours, plain_text
 
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
-PIECES = [
-    *(
-        "\x1b",
-        "\x1b[",
-        "\x9b",
-        "\x1b[31m",
-        "\x1b[38;5;208m",
-        "\x1b[0m",
-        "\x1b[8m",
-        "\x1b[2J",
-        "\x1b[m",
-        "\x1b[38",
-    ),
-    *(
-        "\x1b]0;title\x07",
-        "\x1b]52;c;aGk=\x1b\\",
-        "\x1b]8;;http://x\x1b\\",
-        "\x1bc",
-        "\r",
-        "\n",
-        "\x7f",
-        "m",
-        "31",
-    ),
-    *("\x9b31m", "\x90q\x9c", "\u202e", "\u2066", "\u2028", "\udc80", "[", ";", ":"),
-]
+PIECES = (
+    "\x1b", "\x1b[", "\x9b", "\x1b[31m", "\x1b[38;5;208m", "\x1b[0m", "\x1b[8m", "\x1b[2J", "\x1b[m", "\x1b[38",
+    "\x1b]0;title\x07", "\x1b]52;c;aGk=\x1b\\", "\x1b]8;;http://x\x1b\\", "\x1bc", "\r", "\n", "\x7f", "m", "31",
+    "\x9b31m", "\x90q\x9c", "\u202e", "\u2066", "\u2028", "\udc80", "[", ";", ":",
+)  # fmt: skip
 EVIL = st.lists(st.text(st.characters(), max_size=8) | st.sampled_from(PIECES), max_size=12).map("".join)
 
 
