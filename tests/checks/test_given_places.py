@@ -237,8 +237,9 @@ def test_a_robot_without_a_pose_is_reported_where_it_is_loaded(example: Checkup)
     finding = the_finding(outcome(example, "robot-pose", builds=built(example, panda={"quaternion": None})))
     assert finding.message.startswith("panda ") and finding.function == "_load_agent"
     assert outcome(example, "robot-pose", builds=built(example, cube={"quaternion": None})).state == "kept"
-    without = [each for each in example.builds if not each.of_robot]
-    assert outcome(example, "robot-pose", builds=without).state == "not_applicable"
+    for changes in ({"of_robot": False}, {"kind": "dynamic"}):
+        other = built(example, panda={"quaternion": None, **changes})
+        assert outcome(example, "robot-pose", builds=other).state == "not_applicable"
 
 
 def test_only_a_body_that_may_be_pushed_away_needs_a_pose(example: Checkup) -> None:
@@ -256,6 +257,12 @@ def test_only_a_body_that_may_be_pushed_away_needs_a_pose(example: Checkup) -> N
     inside = replace(example.alone, overlaps=(Overlap(("goal", TABLE), 0.01),))
     for alone, state in ((replace(inside, overlaps=()), "kept"), (inside, "broken")):
         assert outcome(example, "initial-pose", builds=built(example, goal=solid), alone=alone).state == state
+    merges = [Merged("box", frozenset(["goal"]), ("task.py", 1, "_load_scene"))]
+    inside = replace(inside, overlaps=(Overlap(("box", TABLE), 0.01),))
+    in_parts = outcome(
+        example, "initial-pose", builds=built(example, goal=solid), alone=inside, merges=merges
+    )
+    assert in_parts.state == "broken"
     # What has no pose is reported once, not as an overlap too.
     pair = replace(example.alone, overlaps=(Overlap(("cube", TABLE), 0.02),))
     for builds, state in ((built(example), "broken"), (built(example, cube=none), "kept")):

@@ -32,7 +32,7 @@ def typed(line: str) -> tuple[str, TaskOptions]:
     return reference, tyro.cli(EnvArguments, args=rest, config=config).options()
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     st.integers(1, 4096), st.integers(0, 2**31 - 1), st.dictionaries(NAMES, JSON, max_size=3),
     st.sampled_from([None, "stop", "off"]), st.text(min_size=1, max_size=20).filter(lambda t: "\0" not in t),

@@ -79,7 +79,7 @@ WRONG_CALLS = {
         "check push.py --select runs --ignore runs",
         "check push.py --fail-on off",
         "check push.py --sarif push.py/report.sarif",
-        "check untidy.py",
+        "check untidy.py --workers 1",
     ],
     "solve": [
         "solve",
@@ -132,10 +132,7 @@ WRONG_CALLS = {
     "help": ["help camera", "help sliders", "help nonsense"],
 }
 """Wrong calls by command. All are refused before anything is done, except those of `ENDS`."""
-ENDS = {
-    "record broken.py --no-pictures --episodes 1": Exit.FAILED,
-    "rescore made": Exit.NOT_TRUSTED,
-}
+ENDS = {"record broken.py --no-pictures --episodes 1": Exit.FAILED, "rescore made": Exit.NOT_TRUSTED}
 """Exit codes of the calls that start before they fail."""
 
 
