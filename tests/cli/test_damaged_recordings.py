@@ -50,19 +50,18 @@ DAMAGES: dict[str, Damage] = {
 }
 
 
-def ours(folder: Path, name: str) -> Path:
-    """Write a workbench recording with this name; returns its .json."""
-    path = write(folder / "made", made(4, seed=3, task="PickCube-v1"))
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The .json of a workbench recording."""
+    return write(tmp_path_factory.mktemp("ours"), made(4, seed=3, task="PickCube-v1")).with_suffix(".json")
+
+
+def ours(recording: Path, folder: Path, name: str) -> Path:
+    """Copy the recording under this name; returns its .json."""
+    folder.mkdir(exist_ok=True)
     for suffix in (".rrd", ".h5", ".json"):
-        path.with_suffix(suffix).rename(folder / f"{name}{suffix}")
+        shutil.copy(recording.with_suffix(suffix), folder / f"{name}{suffix}")
     return folder / f"{name}.json"
-
-
-def dataset(folder: Path) -> Path:
-    write(folder / "of", made(4))
-    assert run("export", folder / "of", "--lerobot", folder / "set") == 0
-    shutil.rmtree(folder / "of")
-    return folder / "set"
 
 
 def run(*arguments: object) -> int:
@@ -79,24 +78,23 @@ CASES = [
         for name in ("ours.rrd", "ours.json", "theirs.h5", "theirs.json")
         for kind in ("cut", "gone")
     ],
-    ("set/meta/info.json", "cut"),
-    ("set/data", "cut"),
+    *[(name, "cut") for name in ("set/meta/info.json", "set/data")],
 ]
 
 
 @pytest.mark.parametrize(("broken", "kind"), CASES)
 def test_each_command_names_the_damaged_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], broken: str, kind: str
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str], broken: str, kind: str
 ) -> None:
     folder = tmp_path / "recordings"
     folder.mkdir()
     stem = broken.partition("/")[0].partition(".")[0]
     if stem == "ours":
-        ours(folder, "ours")
+        ours(recording, folder, "ours")
     elif stem == "theirs":
         write_foreign(folder)
     else:
-        dataset(folder)
+        assert run("export", recording, "--lerobot", folder / "set") == 0
     file = folder / broken
     DAMAGES[kind](next(file.rglob("*.parquet")) if file.is_dir() else file)
     # Make the files old: for a new .h5, a .json might still be written.
@@ -133,12 +131,12 @@ def test_each_command_names_the_damaged_recording(
 
 
 def test_the_other_recordings_of_the_folder_are_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ours(tmp_path / "recordings", "whole")
-    halve(ours(tmp_path / "recordings", "half").with_suffix(".h5"))
-    halve(write_foreign(tmp_path / "recordings"))
     folder, out = tmp_path / "recordings", tmp_path / "out"
+    ours(recording, folder, "whole")
+    halve(ours(recording, folder, "half").with_suffix(".h5"))
+    halve(write_foreign(folder))
     assert run("share", folder, "--sheet", "--out", out) == 1
     assert {path.name for path in out.iterdir()} == {"whole.sheet.png", "half.sheet.png"}
     printed = capsys.readouterr().err
@@ -153,12 +151,12 @@ def test_the_other_recordings_of_the_folder_are_used(
 
 
 @pytest.mark.slow
-def test_a_file_name_that_is_not_utf_8_works(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_name_that_is_not_utf_8_works(
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, out = tmp_path / "recordings", tmp_path / "out"
     odd = os.fsdecode(b"od\xffd")
-    made_first = ours(folder, "ours")
-    for suffix in (".json", ".rrd", ".h5"):
-        made_first.with_suffix(suffix).rename(folder / f"{odd}{suffix}")
+    ours(recording, folder, odd)
     theirs = write_foreign(folder)
     for suffix in (".h5", ".json"):
         shutil.copy(theirs.with_suffix(suffix), folder / f"by {odd}{suffix}")

@@ -75,8 +75,7 @@ def test_a_rescoring_in_parts_is_one_table_in_the_order_of_the_files(
     assert [row["episode"] for row in csv.DictReader(Path("a.csv").read_text().splitlines())] == names[1:]
     assert merged(files[:1]) == 1 and "1 of the job's recordings" in capsys.readouterr().out
     whole = parts(
-        job_of("rescore", "as recorded", RescoreRequest(1, "", "", False, False, 2, TaskOptions()), ()),
-        *[],
+        job_of("rescore", "as recorded", RescoreRequest(1, "", "", False, False, 2, TaskOptions()), ()), *[]
     )
     assert whole == [] and merged(whole) == 2
 

@@ -46,6 +46,8 @@ def test_a_new_task_breaks_no_rule(
 def test_the_first_template_is_the_default_and_an_existing_file_is_refused(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    code, out, err = run(capsys, "new")
+    assert (code, out) == (2, "") and "workbench new" in err, "a name is asked for only in a terminal"
     assert run(capsys, "new", "first")[0] == 0
     text = (place / "first.py").read_text()
     assert text.startswith('"""The least that a task can be')

@@ -148,10 +148,6 @@ def test_a_debugged_recording_has_one_worker(
         with pytest.raises(SystemExit) as ended:
             main(shlex.split(f"record task.py --debug {wrong}"))
         assert ended.value.code == 2 and len(waited) == 1
-    for wrong in ("export made", "export made --lerobot a --maniskill b.h5", "rescore made --csv --json"):
-        with pytest.raises(SystemExit) as ended:
-            main(shlex.split(wrong))
-        assert ended.value.code == 2
 
 
 def test_check(run: Run) -> None:

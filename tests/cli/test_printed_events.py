@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 from rich.style import Style
 
 from tests.drive.scenes import description, step_of, table_scene
@@ -24,6 +26,8 @@ from workbench.cli.output import (
     print_failures,
     print_line,
     print_problem,
+    print_question,
+    print_texts,
     refuse,
     warn,
 )
@@ -32,7 +36,7 @@ from workbench.jobs.scheduler import Failure
 from workbench.live.messages import Loaded, ReloadReport, RulesBroken, TaskFailed
 from workbench.live.process.captured_output import PrintedLine, StyledText
 from workbench.task.problem import Problem
-from workbench.trust.clearance import CodeFile, Consent, NotTrusted, TrustQuestion
+from workbench.trust.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion
 
 PROBLEM = Problem("step", "KeyError: '[x]'", "/w/task.py", 12, "a['[x]']", "Traceback\n  in [evaluate]\n")
 PUSH = TrustQuestion(
@@ -232,3 +236,30 @@ def test_code_that_was_not_allowed_is_named_with_what_to_do(monkeypatch: pytest.
     can_ask(True)
     (said,) = not_trusted_lines(NotTrusted([PUSH]))
     assert "push.py" not in said, "the person has just read it"
+
+
+MANY = tuple(CodeFile(f"m{k}.py", f"{k:012}", "") for k in range(60))
+
+
+def printed(question: TrustQuestion, what: object = print_question) -> str:
+    out = io.StringIO()
+    assert callable(what)
+    what(question, Console(file=out, width=80))
+    return out.getvalue()
+
+
+def test_every_file_is_named_with_its_hash_and_its_change() -> None:
+    main = CodeFile("/w/push.py", "a" * 12, "", Since.CHANGED)
+    output = printed(TrustQuestion("Push-v1", False, (main, *MANY), trusted_before=True, gone=("old.py",)))
+    lines = output.splitlines()
+    assert f"    /w/push.py  {main.hash}  changed since" in lines
+    assert all(f"    {one.name}  {one.hash}" in lines for one in MANY)
+    assert "It imports these modules next to it:" in lines and "removed since: old.py" in output
+    output = printed(TrustQuestion("Push-v1", False, (main, *MANY), computed=True))
+    assert "it may import every module next to it" in output and "It imports" not in output
+
+
+def test_a_file_is_printed_unchanged_and_as_plain_text() -> None:
+    text = "x = '[bold] :x: \x1b[2J \u202e'\n\treturn 1\n"
+    output = printed(TrustQuestion("Push-v1", True, (CodeFile("push.py", "0" * 12, text),)), print_texts)
+    assert r"x = '[bold] :x: \x1b[2J \u202e'" in output and "\x1b" not in output and "return 1" in output

@@ -12,7 +12,6 @@ import pytest
 
 from workbench.app.help_pages import GROUPS, topics
 from workbench.cli.help import show_help
-from workbench.cli.new import new_in_terminal
 from workbench.cli.output import Exit
 from workbench.cli.share import (
     demonstrations_in_terminal,
@@ -210,15 +209,3 @@ def test_help_without_a_topic_lists_each_topic_once_below_its_group(
     listed = [line[0] for line in lines if line and line[0] in {topic.name for topic in topics()}]
     wanted = [topic.name for _, group in GROUPS for topic in topics() if topic.group == group]
     assert [name for name in listed if name in wanted] == wanted
-
-
-def test_a_name_is_asked_for_only_in_a_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert new_in_terminal("", "") == Exit.REFUSED and "workbench new" in capsys.readouterr().err
-    monkeypatch.setattr("workbench.cli.new.can_ask", lambda: True)
-    answers = iter(["one_push"])
-    monkeypatch.setattr("builtins.input", lambda: next(answers))
-    assert new_in_terminal("", "tabletop") == Exit.DONE, "only what is missing is asked for"
-    assert "compute_dense_reward" in (tmp_path / "one_push.py").read_text()

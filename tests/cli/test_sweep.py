@@ -15,18 +15,7 @@ from workbench.episodes.sweep_results import RESULTS, SweepResults, read_results
 pytestmark = pytest.mark.usefixtures("child_process")
 
 REWARD_TERMS = Path(__file__).parents[2] / "tasks" / "reward_terms.py"
-SHORT = (
-    "--seeds",
-    "3",
-    "--max-steps",
-    "2",
-    "--num-envs",
-    "2",
-    "--env",
-    "render_backend=none",
-    "--workers",
-    "1",
-)
+SHORT = "--seeds 3 --max-steps 2 --num-envs 2 --env render_backend=none --workers 1".split()
 
 
 def run(*given: str) -> int:
@@ -48,16 +37,8 @@ def test_a_sweep_prints_its_points_and_writes_its_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code = sweep(
-        "--set",
-        "MOST=5,1",
-        "--set",
-        "robot_uids=panda,nobody",
-        "--json-file",
-        "a.json",
-        "--csv-file",
-        "a.csv",
-    )
+    settings = ("--set", "MOST=5,1", "--set", "robot_uids=panda,nobody")
+    code = sweep(*settings, "--json-file", "a.json", "--csv-file", "a.csv")
     printed = capsys.readouterr()
     assert code == 1
     assert "3 failed" in printed.out and "0 % (0 - 56)" in printed.out

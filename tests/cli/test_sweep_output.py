@@ -138,18 +138,7 @@ def test_the_files_have_each_point_with_its_own_episodes(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     "given",
-    [
-        [],
-        ["a"],
-        ["a-b=1"],
-        ["a.=1"],
-        ["a=1", "a=2"],
-        ["a=1,1.0"],
-        ["a=x,x"],
-        ["a="],
-        ["a=1,,2"],
-        ["a=x,"],
-    ],
+    [[], ["a"], ["a-b=1"], ["a.=1"], ["a=1", "a=2"], ["a=1,1.0"], ["a=x,x"], ["a="], ["a=1,,2"], ["a=x,"]],
 )
 def test_unclear_settings_are_refused(given: list[str]) -> None:
     with pytest.raises(ValueError, match="--set"):

@@ -153,21 +153,20 @@ def test_golden_recordings_are_rescored_as_recorded(
     assert sum(bool(row["not_judged"]) for row in rows.values()) == 1
 
 
-@pytest.mark.parametrize("kind", ["several", "cameras"])
 def test_golden_recordings_can_be_rescored_with_their_recorded_source(
-    place: Path, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The task on disk differs from the recorded one: its reward is halved."""
     shutil.copytree(place, tmp_path / place.name)
     shutil.copytree(place.parent / "tasks", tmp_path / "tasks")
-    for file in (tmp_path / "tasks/push/push.py", tmp_path / "tasks/several/judging.py"):
-        text = file.read_text()
-        assert "clamp(-1, 1)" in text
-        file.write_text(text.replace("clamp(-1, 1)", "clamp(-1, 1) / 2"))
+    file = tmp_path / "tasks" / "several" / "judging.py"
+    text = file.read_text()
+    assert "clamp(-1, 1)" in text
+    file.write_text(text.replace("clamp(-1, 1)", "clamp(-1, 1) / 2"))
     for arguments, halved in (((), True), (("--recorded-source",), False)):
         table = tmp_path / "table.json"
         code, _, _ = run(
-            capsys, "rescore", tmp_path / place.name / kind, "--json-file", table, "--trust", *arguments
+            capsys, "rescore", tmp_path / place.name / "several", "--json-file", table, "--trust", *arguments
         )
         assert code == Exit.DONE
         (row,) = json.loads(table.read_text())
