@@ -110,7 +110,6 @@ def test_ctrl_c_keeps_finished_episodes_and_ends_the_cluster(tmp_path: Path, ray
         start_new_session=True,
         env={**os.environ, "RAY_TMPDIR": ray_folder},
     )
-    family: list[psutil.Process] = []
     until(
         lambda: len(list((tmp_path / "out").glob("*.json"))) > 40 or process.poll() is not None,
         "some episodes",

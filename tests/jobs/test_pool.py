@@ -106,21 +106,17 @@ def test_a_stopped_job_is_resumed_with_the_remaining_items(executor: Executor, t
     assert rest.squares() == {number: number**2 for number in range(400)}
 
 
-def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
-    return pytest.param(how, says, error, id=how)
-
-
 @child_process
 @pytest.mark.parametrize(
     ("how", "says", "error"),
     [
-        fails("killed", "a process that squares was killed by SIGKILL"),
-        fails("bug", "a process that squares ended with exit code 1"),
-        fails("task", "it broke", TaskError),
-        fails("no UTF-8", r"there is no .*caf\\udce9"),
-        fails("garbage", "a process that squares sent an unreadable message"),
-        fails("another type", "a process that squares sent an unreadable message"),
-        fails("another's", "a process that squares sent the result of an item that it was not given"),
+        ("killed", "a process that squares was killed by SIGKILL", PoolError),
+        ("bug", "a process that squares ended with exit code 1", PoolError),
+        ("task", "it broke", TaskError),
+        ("no UTF-8", r"there is no .*caf\\udce9", PoolError),
+        ("garbage", "a process that squares sent an unreadable message", PoolError),
+        ("another type", "a process that squares sent an unreadable message", PoolError),
+        ("another's", "a process that squares sent the result of an item that it was not given", PoolError),
     ],
 )
 def test_a_failing_process_ends_the_job_and_the_others_finish_their_started_items(
@@ -227,18 +223,6 @@ def test_chunks_are_the_same_whatever_results_are_known() -> None:
     assert probe.scheduler.next("a") is None and probe.results == {0: 0, 1: 1, 2: 2, 4: 4}
 
 
-def test_a_chunk_of_a_dead_worker_is_dealt_again_last_without_its_finished_items() -> None:
-    probe = SchedulerProbe(range(6), chunk=2)
-    assert probe.scheduler.next("a") == Chunk((0, 1), frozenset({0, 1}))
-    probe.scheduler.result("a", 1, 1)
-    probe.scheduler.died("a", "was killed", -9)
-    later = [probe.scheduler.next("b") for _ in range(3)]
-    assert [chunk and chunk.numbers for chunk in later] == [(2, 3), (4, 5), (0, 1)]
-    assert later[2] == Chunk((0, 1), frozenset({0}), again=True)
-    with pytest.raises(PoolError, match="that it was not given"):
-        probe.scheduler.result("b", 1, 1)
-
-
 def test_items_of_a_failed_chunk_are_retried_one_by_one_before_all_others() -> None:
     probe = SchedulerProbe(range(9), chunk=3)
     probe.scheduler.next("a")
@@ -325,19 +309,18 @@ def test_a_group_with_equal_failures_is_abandoned_and_the_others_continue(stage:
     assert sorted(number for failure in failures for number in failure.numbers) == list(range(10))
 
 
-def test_a_worker_that_ends_or_dies_gives_back_what_is_missing() -> None:
-    probe = SchedulerProbe(range(6), chunk=2)
-    for _ in range(2):
+def test_a_dead_workers_chunks_are_dealt_again_last_without_their_finished_items() -> None:
+    def with_two_of_four() -> SchedulerProbe:
+        probe = SchedulerProbe(range(6), chunk=2)
+        assert probe.scheduler.next("a") == Chunk((0, 1), frozenset({0, 1}))
         probe.scheduler.next("a")
-    probe.scheduler.result("a", 0, 0)
-    probe.scheduler.result("a", 3, 3)
+        for number in (0, 3):
+            probe.scheduler.result("a", number, number)
+        return probe
+
     with pytest.raises(PoolError):
-        probe.scheduler.ended("a")
-    probe = SchedulerProbe(range(6), chunk=2)
-    for _ in range(2):
-        probe.scheduler.next("a")
-    for number in (0, 3):
-        probe.scheduler.result("a", number, number)
+        with_two_of_four().scheduler.ended("a")
+    probe = with_two_of_four()
     assert probe.scheduler.count_left(9) == 1
     probe.scheduler.died("a", "was killed", -9)
     assert probe.scheduler.count_left(9) == 3 and probe.scheduler.count_left(2) == 2
@@ -345,6 +328,8 @@ def test_a_worker_that_ends_or_dies_gives_back_what_is_missing() -> None:
     assert [chunk and (chunk.numbers, sorted(chunk.wanted), chunk.again) for chunk in dealt] == [
         ((4, 5), [4, 5], False), ((0, 1), [1], True), ((2, 3), [2], True),
     ]  # fmt: skip
+    with pytest.raises(PoolError, match="that it was not given"):
+        probe.scheduler.result("b", 0, 0)
     for number in (4, 5, 1, 2):
         probe.scheduler.result("b", number, number)
     probe.scheduler.ended("b")

@@ -15,8 +15,6 @@ from workbench.jobs.scheduler import Executor, Failure, ItemQueue, Scheduler, Wo
 from workbench.task.problem import Problem, TaskError
 
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
-
-
 BEGUN = "begun-"
 """Prefix of a marker file per started item; the item's number follows."""
 
@@ -57,24 +55,16 @@ def go_wrong(setup: Setup, queue: ItemQueue) -> None:
     if setup.how == "killed" or (setup.how == "killed once" and not (setup.folder / "killed").exists()):
         (setup.folder / "killed").write_text(str(os.getpid()))
         os.kill(os.getpid(), signal.SIGKILL)
-    elif setup.how == "left":
-        os._exit(0)
     elif setup.how == "task":
         raise TaskError(PROBLEM)
-    elif setup.how == "value":
-        raise ValueError("not such a number")
     elif setup.how == "no UTF-8":
         raise FileNotFoundError("there is no " + os.fsdecode(b"caf\xe9"))
     elif setup.how == "bug":
         raise KeyError("unexpected")
     elif setup.how == "garbage":
         os.write(int(sys.argv[2]), b"\x00\x00\x00\x05hello")
-    elif setup.how == "endless":
-        os.write(int(sys.argv[2]), b"\x7f\xff\xff\xff")
     elif setup.how == "another type":
         queue.send_result(setup.at, "a text")
-    elif setup.how == "no path":
-        queue.send_result(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
     elif setup.how == "another's":
         queue.send_result(10**6, Squared(0, 0, Path(), 0))
     elif setup.how in ("hangs", "half a message"):
@@ -83,15 +73,6 @@ def go_wrong(setup: Setup, queue: ItemQueue) -> None:
         (setup.folder / "hangs").touch()
         while True:
             time.sleep(0.01)
-    elif setup.how == "waits":
-        (setup.folder / "waits").touch()
-        while queue.limit() > setup.at:
-            time.sleep(0.01)
-
-
-def forget(setup: Setup, queue: ItemQueue) -> None:
-    """End without sending the results of a chunk."""
-    queue.next()
 
 
 class Run:
@@ -103,7 +84,6 @@ class Run:
         numbers: Iterable[int],
         stop: Callable[[], bool] = lambda: False,
         on_result: Callable[[Run, int], None] = lambda run, number: None,
-        run: Callable[[Setup, ItemQueue], None] = square,
         **how: Any,
     ) -> None:
         self.results: dict[int, Squared] = {}
@@ -116,7 +96,7 @@ class Run:
         self.scheduler: Scheduler[Squared, str | int] = Scheduler(
             numbers, self.take_result, self.take_update, stop, **how
         )
-        self.work = Work(run, setup, Squared, str | int, "that squares")
+        self.work = Work(square, setup, Squared, str | int, "that squares")
 
     def take_result(self, number: int, result: Squared) -> None:
         assert number not in self.results
