@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,7 @@ from workbench.checks.rule_table import degree_of_each
 from workbench.task.load import load_task, undo_load
 
 SEEDS = [20, 21, 22]
+Judged = Callable[..., RuleResult]
 CHECKS = {rule: check for group in run.GROUPS for rule, check in group.checks.items()}
 
 
@@ -32,6 +34,12 @@ def example() -> Iterator[Checkup]:
     yield made
     made.close()
     undo_load(loaded)
+
+
+@pytest.fixture
+def judged(example: Checkup) -> Judged:
+    """`outcome` on the example's envs."""
+    return functools.partial(outcome, example)
 
 
 def outcome(

@@ -84,17 +84,8 @@ def test_a_finding_has_rule_degree_line_code_and_message_as_text_and_the_tab_cou
 ) -> None:
     assert checks.draw(ChecksView()) == "" and checks.tab == "Checks" and checks.marked == 0
     text = checks.draw()
-    for words in (
-        *(
-            "success-at-reset",
-            ">stop<",
-            "push.py:88",
-            "in evaluate",
-            "x &lt; &lt;i&gt;",
-            "in &lt;b&gt; 8 of 8 seeds",
-        ),
-        'data-copy="# workbench: off[success-at-reset] "',
-    ):
+    for words in ("success-at-reset", ">stop<", "push.py:88", "in evaluate", "x &lt; &lt;i&gt;",
+                  "in &lt;b&gt; 8 of 8 seeds", 'data-copy="# workbench: off[success-at-reset] "'):  # fmt: skip
         assert words in text
     assert "1 stop, 1 kept, 1 not applicable" in checks.live.html() and "2 rules without a finding" in text
     with_failed = (*RESULTS, RuleResult("entry-name", "failed", why="our own mistake"))

@@ -241,11 +241,6 @@ def test_progress_is_counted_in_items_with_several_parts_only() -> None:
         what = options(seeds, num_envs=8, select=("success-at-reset", "outside-reach"))
         counts: list[int] = []
         told: list[RuleResult] = []
-        check(
-            what,
-            on_progress=counts.append,
-            on_result=told.append,
-            executor=Dies(what, ""),
-        )
+        check(what, on_progress=counts.append, on_result=told.append, executor=Dies(what, ""))
         assert counts == expected
         assert len(told) == (2 if seeds == 4 else 0), "another part may change what the first one says"

@@ -164,10 +164,7 @@ def test_the_same_version_is_not_checked_twice(
 
 @pytest.mark.parametrize(
     "changed",
-    [
-        {"env_kwargs": {"control_mode": "pd_joint_pos"}},
-        {"rules": "warn"},
-    ],
+    [{"env_kwargs": {"control_mode": "pd_joint_pos"}}, {"rules": "warn"}],
     ids=lambda changed: next(iter(changed)),
 )
 def test_envs_with_other_options_are_checked_again(
@@ -239,10 +236,7 @@ def test_a_save_stops_a_check_and_results_so_far_stay(
     background.let.release()
     until(lambda: len(shown(checks).results) == 1, "the first rule")
     checks.session.happen(FileSaved())
-    assert (shown(checks).state, shown(checks).stopped_by) == (
-        "stopped",
-        StoppedBy.SAVE,
-    )
+    assert (shown(checks).state, shown(checks).stopped_by) == ("stopped", StoppedBy.SAVE)
     assert rules_of(shown(checks).results) == [FIRST]
     # The same text again, or a save that could not be loaded and was undone.
     background.let = threading.Semaphore(10)

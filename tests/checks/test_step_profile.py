@@ -17,12 +17,12 @@ pytestmark = pytest.mark.thorough
 SLOW = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 
 
-def profile(file: Path, text: str) -> StepProfile:
+def profile(file: Path, text: str, steps: int = 20) -> StepProfile:
     file.write_text(text)
     loaded = load_task(str(file))
     checkup = Checkup(loaded, num_envs=2, seeds=2)
     try:
-        return profile_step(checkup, num_envs=4, steps=20)
+        return profile_step(checkup, num_envs=4, steps=steps)
     finally:
         checkup.close()
         undo_load(loaded)
@@ -44,7 +44,7 @@ def test_a_debuggers_trace_function_is_there_again_afterwards(tmp_path: Path) ->
     trace, before = (lambda frame, event, arg: None), sys.gettrace()
     sys.settrace(trace)
     try:
-        profile(tmp_path / "task.py", EXAMPLE.read_text())
+        profile(tmp_path / "task.py", EXAMPLE.read_text(), steps=1)
         assert sys.gettrace() is trace
     finally:
         sys.settrace(before)

@@ -32,9 +32,7 @@ def silenced(tmp_path: Path) -> Iterator[LoadedTask]:
     undo_load(loaded)
 
 
-def test_an_outlier_is_reported_at_its_rules_hook_unless_silenced_or_off(
-    silenced: LoadedTask,
-) -> None:
+def test_an_outlier_is_reported_at_its_rules_hook_unless_silenced_or_off(silenced: LoadedTask) -> None:
     rules = rules_of_outliers(silenced, None)
     assert {rule: finding.function for rule, finding in rules.items()} == {
         "bodies-stay": "_initialize_episode",

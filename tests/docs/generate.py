@@ -105,12 +105,7 @@ def table(kinds: Sequence[type[Command]]) -> list[str]:
 
 
 def cli_page() -> str:
-    lines = [
-        "# Commands",
-        "",
-        "What `workbench COMMAND --help` prints. This page is made from the code.",
-        "",
-    ]
+    lines = ["# Commands", "", "What `workbench COMMAND --help` prints. This page is made from the code.", ""]
     for name in CLI_COMMANDS:
         lines += [f"## {name}", "", "```text", help_of(name), "```", ""]
     return "\n".join(lines)

@@ -41,9 +41,7 @@ def test_a_generated_page_matches_the_code(page: Path, made: dict[Path, str]) ->
     assert page.read_text() == made[page], AGAIN
 
 
-def test_each_rule_has_the_page_of_its_declaration_and_there_is_no_other_page(
-    made: dict[Path, str],
-) -> None:
+def test_each_rule_has_the_page_of_its_declaration_and_there_is_no_other_page(made: dict[Path, str]) -> None:
     there = {page: page.read_text() for page in generate.RULE_PAGES.iterdir()}
     assert there == {path: text for path, text in made.items() if path.parent == generate.RULE_PAGES}, AGAIN
 

@@ -190,9 +190,7 @@ def test_a_killed_server_leaves_no_family(child_process: None, tmp_path: Path) -
     assert have_ended(processes)
 
 
-def test_a_familys_memory_counts_shared_pages_once(
-    begin: Callable[..., subprocess.Popen[bytes]],
-) -> None:
+def test_a_familys_memory_counts_shared_pages_once(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     keeper = begin("share")
     until(lambda: len(family(keeper.pid)) == 6, "the whole family")
     everyone = family(keeper.pid)[1:]

@@ -78,11 +78,7 @@ def messages() -> list[Any]:
         Call(
             5,
             Rescore(
-                "file.py",
-                TaskOptions(),
-                TaskOptions(),
-                (Source(Path("/a/b.rrd"), None, "1", "one"),),
-                True,
+                "file.py", TaskOptions(), TaskOptions(), (Source(Path("/a/b.rrd"), None, "1", "one"),), True
             ),
         ),
     ]
