@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.drive.commands import exit_code
 from workbench.cli import main
 from workbench.cli.arguments import EnvArguments, history_bytes
 
@@ -60,10 +61,8 @@ def test_a_package_older_than_the_range_is_named_with_the_pip_command(
     with pytest.raises(ImportError):
         main.main(["review", str(tmp_path)])
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: ["viser>=99"])
-    with pytest.raises(SystemExit) as ended:
-        main.main(["review", str(tmp_path)])
+    assert exit_code("review", tmp_path) == 2
     first, second = capsys.readouterr().err.splitlines()
-    assert ended.value.code == 2
     assert first.startswith("viser>=99 is required, ") and second.endswith(" 'viser>=99'")
 
 
@@ -72,8 +71,7 @@ def test_the_old_name_of_an_option_works_and_warns_once(
     given: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     example = str(Path(__file__).parents[2] / "tasks" / "push_cube.py")
-    with pytest.raises(SystemExit) as ended:
-        main.main(["check", example, *given])
+    assert exit_code("check", example, *given) == 2
     stderr = capsys.readouterr().err
-    assert ended.value.code == 2 and "--num-envs must be from 1 to 4096, not 0" in stderr
+    assert "--num-envs must be from 1 to 4096, not 0" in stderr
     assert stderr.count("is called --num-envs now") == 1

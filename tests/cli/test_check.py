@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from tests.drive.commands import exit_code, line_of
 from workbench.checks.rule_table import RULES
-from workbench.cli.main import main
 
 pytestmark = pytest.mark.thorough
 
@@ -45,10 +45,8 @@ class Ended:
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
-    with pytest.raises(SystemExit) as ended:
-        main(["check", *arguments])
-    printed = capsys.readouterr()
-    return Ended(int(ended.value.code or 0), printed.out, printed.err)
+    code = exit_code("check", *arguments)
+    return Ended(code, *capsys.readouterr())
 
 
 def run_in_subprocess(*words: str) -> subprocess.CompletedProcess[str]:
@@ -77,11 +75,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("COLUMNS", "100")
     return folder
-
-
-def line_of(file: Path, words: str) -> int:
-    text = file.read_text()
-    return text[: text.index(words)].count("\n") + 1
 
 
 def test_findings_are_printed_by_degree_with_line_and_reason(
@@ -285,10 +278,8 @@ def test_merged_parts_print_the_same_as_the_whole(place: Path, capsys: pytest.Ca
     whole = run(capsys, *few, *files("whole"))
     for part in ("1/2", "2/2"):
         assert f"Part {part} is in check-{part[0]}-of-2.job" in run(capsys, *few, "--shard", part).err
-    with pytest.raises(SystemExit) as ended:
-        main(["merge", "check-1-of-2.job", "check-2-of-2.job", *files("merged")])
+    assert exit_code("merge", "check-1-of-2.job", "check-2-of-2.job", *files("merged")) == whole.code == 1
     printed = capsys.readouterr().out
-    assert ended.value.code == whole.code == 1
     assert printed.splitlines()[:-1] == whole.out.splitlines()[:-1]
     durations = re.compile(r'"(start_|picture_)?seconds": [^,\n]*| time(stamp)?="[^"]*"')
     for kind in ("json", "sarif", "xml"):

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.drive.commands import exit_code
 from tests.drive.episodes import made, write
 from tests.episodes.foreign_h5 import write as write_foreign
-from workbench.cli.main import main
 from workbench.episodes.reader.reading import find_all_sources
 from workbench.library.folder import Library
 from workbench.share.make import MakeRequest, make
@@ -64,13 +64,6 @@ def ours(recording: Path, folder: Path, name: str) -> Path:
     return folder / f"{name}.json"
 
 
-def run(*arguments: object) -> int:
-    """Run a command; returns its exit code."""
-    with pytest.raises(SystemExit) as ended:
-        main([*map(str, arguments)])
-    return int(ended.value.code or 0)
-
-
 CASES = [
     *[("ours.h5", kind) for kind in DAMAGES],
     *[
@@ -94,7 +87,7 @@ def test_each_command_names_the_damaged_recording(
     elif stem == "theirs":
         write_foreign(folder)
     else:
-        assert run("export", recording, "--lerobot", folder / "set") == 0
+        assert exit_code("export", recording, "--lerobot", folder / "set") == 0
     file = folder / broken
     DAMAGES[kind](next(file.rglob("*.parquet")) if file.is_dir() else file)
     # Make the files old: for a new .h5, a .json might still be written.
@@ -117,7 +110,7 @@ def test_each_command_names_the_damaged_recording(
         commands["rescore"] = ["rescore", folder, "--json", "--trust"]
     for name, command in commands.items():
         capsys.readouterr()
-        code = run(*command)
+        code = exit_code(*command)
         printed = capsys.readouterr()
         assert code == 1, (name, printed)
         if name == "rescore":
@@ -137,15 +130,15 @@ def test_the_other_recordings_of_the_folder_are_used(
     ours(recording, folder, "whole")
     halve(ours(recording, folder, "half").with_suffix(".h5"))
     halve(write_foreign(folder))
-    assert run("share", folder, "--sheet", "--out", out) == 1
+    assert exit_code("share", folder, "--sheet", "--out", out) == 1
     assert {path.name for path in out.iterdir()} == {"whole.sheet.png", "half.sheet.png"}
     printed = capsys.readouterr().err
     assert "half.h5" in printed and "theirs.h5" in printed and "whole" not in printed
     for option, made_of in (("--lerobot", out / "set"), ("--maniskill", out / "demos.h5")):
-        assert run("export", folder, option, made_of) == 1 and not made_of.exists()
+        assert exit_code("export", folder, option, made_of) == 1 and not made_of.exists()
         capsys.readouterr()
         # Skipped as requested, and named.
-        assert run("export", folder, option, made_of, "--only-fitting") == 0 and made_of.exists()
+        assert exit_code("export", folder, option, made_of, "--only-fitting") == 0 and made_of.exists()
         printed = capsys.readouterr()
         assert "half.h5" in printed.err and "theirs.h5" in printed.err and "1 episode" in printed.out
 
@@ -160,12 +153,12 @@ def test_a_file_name_that_is_not_utf_8_works(
     theirs = write_foreign(folder)
     for suffix in (".h5", ".json"):
         shutil.copy(theirs.with_suffix(suffix), folder / f"by {odd}{suffix}")
-    assert run("share", folder / f"{odd}.json", "--sheet", "--html", "--out", out) == 0
+    assert exit_code("share", folder / f"{odd}.json", "--sheet", "--html", "--out", out) == 0
     assert {path.name for path in out.iterdir()} == {f"{odd}.sheet.png", f"{odd}.html"}
-    assert run("export", folder / f"{odd}.h5", "--lerobot", out / "set") == 0
+    assert exit_code("export", folder / f"{odd}.h5", "--lerobot", out / "set") == 0
     for option, made_of in (("--lerobot", out / "sets"), ("--maniskill", out / "demos.h5")):
         capsys.readouterr()
-        assert run("export", folder, option, made_of, "--only-fitting") == 0
+        assert exit_code("export", folder, option, made_of, "--only-fitting") == 0
         printed = capsys.readouterr()
         assert "2 episodes" in printed.out and "od\\udcffd" in printed.err and "theirs" not in printed.err
     made_of = [source for source in find_all_sources([folder]) if source.part is None]
@@ -174,9 +167,9 @@ def test_a_file_name_that_is_not_utf_8_works(
         assert sorted(opened.namelist()) == [f"od\\udcffd{suffix}" for suffix in (".h5", ".json", ".rrd")]
     table = tmp_path / "table"
     arguments = "--trust", "--workers", 2, "--num-envs", 1
-    assert run("rescore", folder, "--csv-file", table, "--json-file", f"{table}.json", *arguments) == 0
+    assert exit_code("rescore", folder, "--csv-file", table, "--json-file", f"{table}.json", *arguments) == 0
     names = [row["episode"] for row in json.loads(Path(f"{table}.json").read_text())]
     assert names == [f"by {odd}#traj_0", odd, "theirs#traj_0"]
     assert all(name in table.read_text() for name in ("by od\\udcffd#traj_0", "theirs#traj_0"))
-    assert run("record", "PickCube-v1", "--episodes", 1, "--out", tmp_path / odd) == 2
+    assert exit_code("record", "PickCube-v1", "--episodes", 1, "--out", tmp_path / odd) == 2
     assert not (tmp_path / odd).exists() and "UTF-8" in capsys.readouterr().err

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.drive.commands import exit_code, line_of
 from tests.drive.session import TASKS
-from workbench.cli.main import main
 
 pytestmark = pytest.mark.thorough
 
@@ -26,17 +26,11 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
     def run(task: str, *more: str) -> dict[str, Any]:
         capsys.readouterr()
-        with pytest.raises(SystemExit):
-            main(["check", task, "--select", "runs", "--json", *FEW, *more])
+        exit_code("check", task, "--select", "runs", "--json", *FEW, *more)
         report = json.loads(capsys.readouterr().out)
         return report["error"] or (report["findings"] or [{}])[0]
 
     return run
-
-
-def line_of(file: Path, words: str) -> int:
-    text = file.read_text()
-    return text[: text.index(words)].count("\n") + 1
 
 
 def edited(folder: Path, *edits: tuple[str, str]) -> Path:
@@ -287,10 +281,8 @@ def test_a_missing_mesh_is_reported_with_the_link_naming_it(
     visual = '<visual><geometry><mesh filename="meshes/arm.stl"/></geometry></visual>'
     described.write_text(URDF.replace('<link name="arm">', f'<link name="arm">{visual}'))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(["record", "stick.py", "--episodes", "1", "--num-envs", "1"])
+    assert exit_code("record", "stick.py", "--episodes", "1", "--num-envs", "1") == 1
     stderr = capsys.readouterr().err
-    assert ended.value.code == 1
     assert f"{robot}:{line_of(robot, 'urdf_path')}" in stderr, stderr
     assert f"{described}:{line_of(described, visual)}" in stderr and "'arm'" in stderr
     assert str(tmp_path / "meshes" / "arm.stl") in stderr

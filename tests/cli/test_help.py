@@ -12,8 +12,8 @@ import termios
 
 import pytest
 
+from tests.drive.commands import exit_code
 from workbench.app.help_pages import Topic, topics
-from workbench.cli import main
 from workbench.cli.output import Exit
 from workbench.machine.processes.child_environment import python_command
 
@@ -21,10 +21,8 @@ pytestmark = pytest.mark.thorough
 
 
 def help_output(capsys: pytest.CaptureFixture[str], *call: str) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as ended:
-        main.main(["help", *call])
-    printed = capsys.readouterr()
-    return int(ended.value.code or 0), printed.out + printed.err
+    code = exit_code("help", *call)
+    return code, "".join(capsys.readouterr())
 
 
 @pytest.mark.parametrize("topic", topics(), ids=lambda topic: topic.name)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.cli import main
+from tests.drive.commands import exit_code
 from workbench.machine.folders import web_assets_folder
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -28,14 +28,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main.main(arguments)
-    code = ended.value.code
-    assert isinstance(code, int)
-    return code
-
-
 def bits(folder: Path) -> dict[str, bytes]:
     found = {re.sub(r".*_(seed\d+)_.*", r"\1", path.name): path.read_bytes() for path in folder.glob("*.h5")}
     assert len(found) == len(list(folder.glob("*.h5"))) == len(list(folder.glob("*.json")))
@@ -44,7 +36,7 @@ def bits(folder: Path) -> dict[str, bytes]:
 
 def record(*arguments: str) -> int:
     few = ("--episodes", "6", "--num-envs", "2", "--no-pictures", "--workers", "1")
-    return run("record", "my_task.py", *few, *QUICK, *arguments)
+    return exit_code("record", "my_task.py", *few, *QUICK, *arguments)
 
 
 def test_merged_parts_completed_by_a_resumed_job_equal_the_whole(
@@ -55,9 +47,9 @@ def test_merged_parts_completed_by_a_resumed_job_equal_the_whole(
         assert record("--shard", part, "--out", f"parts/{part[0]}") == 0
     assert {path.name for path in place.glob("*.job")} == {"record-1-of-3.job", "record-3-of-3.job"}
     parts = ("record-1-of-3.job", "record-3-of-3.job")
-    assert run("merge", *parts) == 2
+    assert exit_code("merge", *parts) == 2
     assert "the episodes are in 2 folders" in capsys.readouterr().err
-    assert run("merge", *parts, "--out", "demos", "--job", "whole.job") == 1
+    assert exit_code("merge", *parts, "--out", "demos", "--job", "whole.job") == 1
     assert (
         "2 of the job's episodes are in none of these files: number 2, number 3\n" in capsys.readouterr().out
     )
@@ -66,7 +58,7 @@ def test_merged_parts_completed_by_a_resumed_job_equal_the_whole(
     # Existing episodes are not reported as progress.
     assert re.findall(r"^episode (\d):", capsys.readouterr().err, re.M) == ["2", "3"]
     assert bits(place / "demos") == bits(place / "whole") and len(bits(place / "demos")) == 6
-    assert run("merge", "whole.job") == 0
+    assert exit_code("merge", "whole.job") == 0
     assert str(place / "demos") in capsys.readouterr().out
 
 
@@ -86,7 +78,7 @@ def test_a_part_of_another_job_is_refused(place: Path, capsys: pytest.CaptureFix
     assert record("--shard", "1/3", "--out", "demos") == 0
     assert record("--shard", "2/3", "--out", "demos", "--seed", "5") == 0
     capsys.readouterr()
-    assert run("merge", "record-1-of-3.job", "record-2-of-3.job") == 2
+    assert exit_code("merge", "record-1-of-3.job", "record-2-of-3.job") == 2
     assert "belongs to another job: seed is 0 here and 5 there" in capsys.readouterr().err
 
 
@@ -105,5 +97,7 @@ def test_the_script_of_the_docs_runs_its_part_as_an_array_task(place: Path) -> N
             timeout=120,
         )
     subprocess.run(merge, shell=True, check=True, env=environment, timeout=120)
-    assert run("record", "my_task.py", "--episodes", "16", "--no-pictures", *QUICK, "--out", "whole") == 0
+    assert (
+        exit_code("record", "my_task.py", "--episodes", "16", "--no-pictures", *QUICK, "--out", "whole") == 0
+    )
     assert bits(place / "demos") == bits(place / "whole") and len(bits(place / "demos")) == 16

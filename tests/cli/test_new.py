@@ -11,15 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from workbench.cli.main import main
+from tests.drive.commands import exit_code
 from workbench.task.new_task import TEMPLATES
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main([*arguments])
-    printed = capsys.readouterr()
-    return int(ended.value.code or 0), printed.out, printed.err
+    code = exit_code(*arguments)
+    return code, *capsys.readouterr()
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from tests.drive.commands import exit_code
 from workbench.checks.job_items import CheckOptions
 from workbench.cli.arguments import JobArguments, imported, separated, why_unwritable
 from workbench.cli.check import CheckOutput
-from workbench.cli.main import main
 from workbench.cli.merge import MergeOutput
 from workbench.cli.rescore import RescoreOptions, RescoreOutput
 from workbench.cli.solve import SolveOutput
@@ -61,9 +61,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
             return 7
 
         monkeypatch.setattr(f"workbench.cli.{function}", take)
-        with pytest.raises(SystemExit) as ended:
-            main(shlex.split(line))
-        assert ended.value.code == 7, "the exit code is that of the function"
+        assert exit_code(*shlex.split(line)) == 7, "the exit code is that of the function"
         (given,) = got
         return given
 
@@ -145,9 +143,7 @@ def test_a_debugged_recording_has_one_worker(
     _, where = run("record.record_in_terminal", "record task.py --debug --job a.job")
     assert where == JobArguments(workers=1, job=Path("a.job")) and len(waited) == 1
     for wrong in ("--workers 2", "--cluster local"):
-        with pytest.raises(SystemExit) as ended:
-            main(shlex.split(f"record task.py --debug {wrong}"))
-        assert ended.value.code == 2 and len(waited) == 1
+        assert exit_code(*f"record task.py --debug {wrong}".split()) == 2 and len(waited) == 1
 
 
 def test_check(run: Run) -> None:
@@ -250,10 +246,8 @@ def test_impossible_values_are_refused_before_anything_begins(
     wrong += [] if command in ("record", "rescore") else ["--seeds 0"]
     wrong += ["--json-file gone.py/a --csv-file task.py/a"] if command not in ("record", "check") else []
     for option in wrong:
-        with pytest.raises(SystemExit) as ended:
-            main(shlex.split(f"{line} {option}"))
-        printed = capsys.readouterr()
-        assert ended.value.code == 2 and printed.out == "", option
+        assert exit_code(*f"{line} {option}".split()) == 2, option
+        assert capsys.readouterr().out == "", option
 
 
 def test_names_of_modules_files_and_rules_are_read(place: Path) -> None:

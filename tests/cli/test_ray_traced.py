@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.cli.main import main
+from tests.drive.commands import exit_code
 from workbench.envs.backends import why_no_ray_tracing
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -36,9 +36,7 @@ def test_a_ray_traced_camera_is_recorded_and_the_recording_says_how(
     traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, line = traced
-    with pytest.raises(SystemExit) as ended:
-        main(["record", str(file), "--episodes", "1", "--max-steps", "2"])
-    assert ended.value.code == 0
+    assert exit_code("record", file, "--episodes", "1", "--max-steps", "2") == 0
     assert f"{file}:{line}" in capsys.readouterr().err
     (description,) = file.parent.glob("recordings/*.json")
     cameras = json.loads(description.read_text())["workbench"]["cameras"]
@@ -52,9 +50,8 @@ def test_the_check_of_a_ray_traced_camera_ends_with_a_finding(
     traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, line = traced
-    with pytest.raises(SystemExit) as ended:
-        rules = "ray-traced,camera-sees,hidden-goal"
-        main(["check", str(file), "--select", rules, "--seeds", "2", "--workers", "1", "--json"])
+    rules = "ray-traced,camera-sees,hidden-goal"
+    assert exit_code("check", file, "--select", rules, "--seeds", "2", "--workers", "1", "--json") == 0
     report = json.loads(capsys.readouterr().out)
     (finding,) = [each for each in report["findings"] if each["rule"] == "ray-traced"]
-    assert (ended.value.code, finding["file"], finding["line"]) == (0, file.name, line)
+    assert (finding["file"], finding["line"]) == (file.name, line)

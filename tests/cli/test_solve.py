@@ -19,11 +19,11 @@ from xml.etree import ElementTree
 
 import pytest
 
+from tests.drive.commands import exit_code
 from tests.drive.waiting import until
 from workbench.checks.job import CheckReport
 from workbench.checks.job_items import CheckedTask
 from workbench.checks.results import RuleResult
-from workbench.cli.main import main
 from workbench.cli.output import Exit
 from workbench.cli.solve import (
     SolveOutput,
@@ -301,10 +301,8 @@ def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.Captur
     # A seed ends after its first step.
     ends = "--seconds-per-seed 1e-6 --fail-on never"
     written = f"--json-file {files['json']} --csv-file {files['csv']} --junit {files['xml']}"
-    with pytest.raises(SystemExit) as ended:
-        main(f"{call} {ends} {written}".split())
+    assert exit_code(*f"{call} {ends} {written}".split()) == 0
     stdout = capsys.readouterr().out
-    assert ended.value.code == 0, stdout
     assert "Solved 0 of 2 seeds" in stdout and "workbench review" in stdout
     report = json.loads(files["json"].read_text())
     assert (report["solved"], report["tried"], report["plan"]["rollouts"]) == (0, 2, 16)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.cli.main import main
+from tests.drive.commands import exit_code
 from workbench.episodes.sweep_results import RESULTS, SweepResults, read_results
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -18,14 +18,8 @@ REWARD_TERMS = Path(__file__).parents[2] / "tasks" / "reward_terms.py"
 SHORT = "--seeds 3 --max-steps 2 --num-envs 2 --env render_backend=none --workers 1".split()
 
 
-def run(*given: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([*given])
-    return int(ended.value.code or 0)
-
-
 def sweep(*given: str) -> int:
-    return run("sweep", str(REWARD_TERMS), *SHORT, *given)
+    return exit_code("sweep", REWARD_TERMS, *SHORT, *given)
 
 
 def numbers(folder: Path) -> SweepResults:
@@ -90,5 +84,5 @@ def test_an_upload_is_a_complete_sweep_and_is_resumed(
     assert sweep(*given) == 0
     assert {file: file.stat().st_mtime_ns for file in there.glob("*/*")} == made
     # A sweep copied back from the upload opens like one made locally.
-    assert run("merge", "s.job") == 0
+    assert exit_code("merge", "s.job") == 0
     assert read_results(there / RESULTS) == results

@@ -35,22 +35,8 @@ CLI = DOCS / "reference" / "cli.md"
 GPU_RULES_PAGE = DOCS / "batched_env.md"
 ALL_RULES = DOCS / "reference" / "rules.md"
 RULE_PAGES = DOCS / "rules"
-CLI_COMMANDS = (
-    "start",
-    "new",
-    "open",
-    "review",
-    "record",
-    "check",
-    "solve",
-    "sweep",
-    "merge",
-    "rescore",
-    "share",
-    "export",
-    "view",
-    "doctor",
-    "help",
+CLI_COMMANDS = tuple(
+    "start new open review record check solve sweep merge rescore share export view doctor help".split()
 )
 """Commands in reading order; `test_generated.py` compares them with the existing commands."""
 

@@ -20,7 +20,7 @@ import workbench
 from tests.docs.commands import OPENS_A_PAGE, commands, opens
 from tests.docs.pages import Fence, fences
 from tests.docs.walk import FILE, PAGE, STEPS, Step, after, mistake, write
-from workbench.cli.main import main
+from tests.drive.commands import exit_code
 
 ENV_ID = "PushIt-v1"
 UNTIL_LATER = {"3. The scene": {"kinematic-never-moved"}, "4. Where an episode begins": {"success-at-reset"}}
@@ -133,7 +133,6 @@ def run_command(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
         # Start as in a new process: another test's recording may have left the task registered.
         known.pop(ENV_ID, None)
     capfd.readouterr()
-    with pytest.raises(SystemExit):
-        main([*words, *QUICK.get(words[0], [])])
+    exit_code(*words, *QUICK.get(words[0], []))
     printed = capfd.readouterr()
     return f"{printed.out}\n{printed.err}"

@@ -16,8 +16,8 @@ from typing import Any, NoReturn
 
 import pytest
 
+from tests.drive.commands import exit_code
 from tests.golden.make import GOLDEN
-from workbench.cli import main
 from workbench.cli.output import Exit
 
 SHAPES = Path(__file__).parent / "cli"
@@ -161,10 +161,8 @@ def plain_terminal(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
 
 def run(capsys: pytest.CaptureFixture[str], call: str) -> tuple[int, str]:
     """Return the exit code and the printed text."""
-    with pytest.raises(SystemExit) as ended:
-        main.main(shlex.split(call))
-    printed = capsys.readouterr()
-    return int(ended.value.code or 0), printed.out + printed.err
+    code = exit_code(*shlex.split(call))
+    return code, "".join(capsys.readouterr())
 
 
 def assert_unchanged(name: str, text: str) -> None:

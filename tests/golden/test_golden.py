@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.drive.commands import exit_code
 from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.app.session import Session
-from workbench.cli.main import main
 from workbench.cli.output import Exit
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.recorded_source import run_of
@@ -50,10 +50,8 @@ def expected(place: Path) -> dict[str, Any]:
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     """Run a command in this process; return its exit code, stdout and stderr."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    return int(ended.value.code or 0), printed.out, printed.err
+    code = exit_code(*arguments)
+    return code, *capsys.readouterr()
 
 
 def test_golden_recordings_are_small() -> None:

@@ -13,11 +13,11 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.drive.commands import exit_code, line_of
 from tests.drive.session import wait_until
 from tests.live.debug_client import DebugClient
 from workbench.app.session import Session
 from workbench.app.status_line import status_values
-from workbench.cli.main import main
 from workbench.live.commands import Interrupt, RestartWorker, Step
 from workbench.live.panels.banners import is_busy_for_long
 from workbench.live.process import supervisor
@@ -32,10 +32,6 @@ HANG_SECONDS = 0.3
 
 EVALUATE_LINE, REWARD_LINE = "distance = torch.linalg.norm(", "behind_cube = self.cube.pose.p.clone()"
 """The first lines of two hooks of the task."""
-
-
-def line_of(file: Path, text: str) -> int:
-    return next(i for i, line in enumerate(file.read_text().splitlines(), 1) if text in line)
 
 
 def count_printed(view: SessionView, words: str) -> int:
@@ -185,6 +181,4 @@ def test_a_port_in_use_is_refused_if_given_and_replaced_if_not(monkeypatch: pyte
 def test_debug_options_that_open_a_port_to_other_users_are_refused(
     options: tuple[str, ...], task_file: Path
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["open", str(task_file), *options])
-    assert ended.value.code == 2
+    assert exit_code("open", task_file, *options) == 2
