@@ -20,7 +20,12 @@ JOB = JobKey("square", {"command": "square", "seeds": "9"}, b"")
 
 
 def run(
-    path: Path, shard: Shard = WHOLE, job: JobKey = JOB, stop_after: int = 99
+    path: Path,
+    shard: Shard = WHOLE,
+    job: JobKey = JOB,
+    stop_after: int = 99,
+    squared: Callable[[int], int] = lambda number: number**2,
+    is_there: Callable[[int], bool] = lambda result: True,
 ) -> tuple[dict[int, int], list[int]]:
     """Run a job that squares nine numbers; returns the results, and the numbers computed in this run."""
     made: list[int] = []
@@ -31,14 +36,16 @@ def run(
             for number in sorted(chunk.wanted):
                 if number < queue.limit():
                     made.append(number)
-                    queue.send_result(number, number**2)
+                    queue.send_result(number, squared(number))
 
     scheduler: Scheduler[int, None] = Scheduler(
         range(9), results.__setitem__, stop=lambda: len(made) >= stop_after, chunk=2
     )
     file = JobFile(path, job)
     try:
-        Kept(ThisProcess(), file, shard).run(Work(square, None, int, None, "that squares"), scheduler)
+        Kept(ThisProcess(), file, shard, is_there).run(
+            Work(square, None, int, None, "that squares"), scheduler
+        )
     finally:
         file.close()
     return results, made
@@ -130,21 +137,9 @@ def test_a_file_that_is_open_in_another_process_is_not_used(tmp_path: Path) -> N
 
 def test_an_item_whose_files_are_gone_runs_again(tmp_path: Path) -> None:
     run(tmp_path / "a.job")
-    made: list[int] = []
-
-    def square(setup: None, queue: ItemQueue) -> None:
-        while (chunk := queue.next()) is not None:
-            for number in sorted(chunk.wanted):
-                made.append(number)
-                queue.send_result(number, -1)
-
-    results: dict[int, int] = {}
-    scheduler: Scheduler[int, None] = Scheduler(range(9), results.__setitem__, chunk=2)
-    file = JobFile(tmp_path / "a.job", JOB)
-    Kept(ThisProcess(), file, is_there=lambda square: square not in (4, 49)).run(
-        Work(square, None, int, None, "that squares"), scheduler
+    results, made = run(
+        tmp_path / "a.job", squared=lambda number: -1, is_there=lambda square: square not in (4, 49)
     )
-    file.close()
     assert made == [2, 7] and results == {n: -1 if n in (2, 7) else n * n for n in range(9)}
     assert read_parts([tmp_path / "a.job"]).results(int) == results, "the new results are kept"
 

@@ -99,6 +99,7 @@ CARD = {"built": "12.8", "cuda": ["A card"], "why_not": None, "library": "/lib/P
         ({"memory": (16, 6)}, "cores, memory", True, ["6.0 GiB"]),
         ({"landlock": 0}, "reading", None, ["Landlock"]),
         ({}, "reading", True, ["Landlock 3"]),
+        ({}, "packages", True, ["viser ", "torch ", "numpy "]),
         ({"python": (3, 10, 9)}, "Python", False, ["3.12"]),
         ({"python": (3, 13, 0)}, "Python", False, ["3.12"]),
         ({"python": (3, 12, 1)}, "Python", True, []),
