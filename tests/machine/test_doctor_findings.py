@@ -45,6 +45,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, DoctorFind
             "cores": 4,
             "landlock": 3,
             "python": (3, 11, 2),
+            "system": "Linux",
             "chromium": "/bin/chromium",
             "mixed": None,
             "untested": {},
@@ -80,6 +81,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, DoctorFind
             for name, value in patches.items():
                 patch.setattr(doctor, name, value)
             patch.setattr(doctor.sys, "version_info", machine["python"])
+            patch.setattr(doctor.platform, "system", lambda: machine["system"])
             patch.setattr(os, "sched_getaffinity", lambda pid: set(range(machine["cores"])))
             patch.setattr(doctor.versions, "untested", lambda: machine["untested"])
             patch.setattr(doctor.versions, "maniskill", lambda: machine["maniskill"])
@@ -103,6 +105,7 @@ CARD = {"built": "12.8", "cuda": ["A card"], "why_not": None, "library": "/lib/P
         ({"python": (3, 10, 9)}, "Python", False, ["3.12"]),
         ({"python": (3, 13, 0)}, "Python", False, ["3.12"]),
         ({"python": (3, 12, 1)}, "Python", True, []),
+        ({"system": "Darwin"}, "Python", None, ["Linux"]),
         ({"chromium": None}, "browser (tests)", None, ["hromium"]),
         ({}, "browser (tests)", True, ["/bin/chromium", "1.2.3.4"]),
         ({}, "render device", True, ["a card", "driver 1.0"]),
