@@ -46,7 +46,8 @@ class Ended:
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
     code = exit_code("check", *arguments)
-    return Ended(code, *capsys.readouterr())
+    printed = capsys.readouterr()
+    return Ended(code, printed.out, printed.err)
 
 
 def run_in_subprocess(*words: str) -> subprocess.CompletedProcess[str]:

@@ -51,7 +51,8 @@ def expected(place: Path) -> dict[str, Any]:
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     """Run a command in this process; return its exit code, stdout and stderr."""
     code = exit_code(*arguments)
-    return code, *capsys.readouterr()
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
 
 
 def test_golden_recordings_are_small() -> None:
