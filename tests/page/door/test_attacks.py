@@ -8,6 +8,7 @@ import http.server
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from urllib.parse import quote
 
 import msgspec
@@ -31,6 +32,7 @@ from tests.drive.knocking import (
     say,
     token_of,
 )
+from tests.drive.messages import ANY_VALUE
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from workbench.page.door import responses, viser_private
@@ -59,9 +61,8 @@ LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
 @pytest.fixture(scope="module")
 def gated_server() -> Iterator[GatedServer]:
     """One server for all tests of this file."""
-    gated_server = open_server(ServerOptions(port=0))
-    yield gated_server
-    gated_server.close()
+    with closing(open_server(ServerOptions(port=0))) as gated_server:
+        yield gated_server
 
 
 @pytest.fixture
@@ -127,19 +128,20 @@ def test_a_rebound_host_is_refused_even_with_the_token(gated_server):
         assert ask(gated_server, f"/?token={token_of(gated_server)}", Host=host)[0] == 403
 
 
-def test_two_hosts_or_two_origins_are_refused(gated_server):
-    for name, first, second in (
-        ("Host", f"127.0.0.1:{gated_server.port}", "evil.example"),
-        ("Origin", f"http://127.0.0.1:{gated_server.port}", "https://evil.example"),
-    ):
-        request = (
-            f"GET / HTTP/1.1\r\n{name}: {first}\r\n{name}: {second}\r\nCookie: {cookie_of(gated_server)}\r\n"
-        )
-        if name == "Origin":
-            request += f"Host: 127.0.0.1:{gated_server.port}\r\n"
-        with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as raw:
-            raw.sendall(request.encode() + b"\r\n")
-            assert raw.recv(12) == b"HTTP/1.1 403"
+@pytest.mark.parametrize(
+    "headers",
+    [
+        "Host: {ours}\r\nHost: evil.example",
+        "Host: {ours}\r\nOrigin: http://{ours}\r\nOrigin: https://evil.example",
+    ],
+    ids=["hosts", "origins"],
+)
+def test_two_hosts_or_two_origins_are_refused(gated_server, headers):
+    headers = headers.format(ours=f"127.0.0.1:{gated_server.port}")
+    request = f"GET / HTTP/1.1\r\n{headers}\r\nCookie: {cookie_of(gated_server)}\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as raw:
+        raw.sendall(request.encode())
+        assert raw.recv(12) == b"HTTP/1.1 403"
 
 
 def test_without_the_token_nothing_is_served(gated_server):
@@ -172,16 +174,13 @@ def test_the_right_token_becomes_a_cookie_and_is_removed_from_the_address(gated_
 
 
 def test_the_cookie_of_another_ports_workbench_is_refused(gated_server):
-    other = open_server(ServerOptions(port=0))
-    try:
+    with closing(open_server(ServerOptions(port=0))) as other:
         assert both(gated_server, Cookie=cookie_of(other)) == (403, 403)
         assert both(gated_server, Cookie=f"{cookie_name(gated_server.port)}={token_of(other)}") == (403, 403)
         assert both(gated_server, Cookie=f"{cookie_name(other.port)}={token_of(gated_server)}") == (403, 403)
         # A browser that is logged in to both sends both cookies, in any order.
         assert both(gated_server, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
         assert both(other, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
-    finally:
-        other.close()
 
 
 PATHS = [
@@ -210,26 +209,6 @@ def test_no_path_leads_out_of_the_served_folders(gated_server):
         status, _, body = ask(gated_server, path)
         assert status == 404, path
         assert b"root:" not in body and b"[project]" not in body and b"version" not in body
-
-
-@pytest.mark.parametrize(
-    "raw",
-    [
-        b"\x00\x01\x02\r\n\r\n",
-        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost\r\n\r\n",
-        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 1000 + b"\r\n",
-        b"\x16\x03\x01\x02\x00\x01\x00",  # TLS
-    ],
-)
-def test_garbage_instead_of_http_does_no_harm(gated_server, bystander, raw, capfd):
-    with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as connection:
-        connection.sendall(raw)
-        connection.shutdown(socket.SHUT_WR)
-        answer = connection.recv(64)
-    assert b" 200 " not in answer and b" 101 " not in answer
-    bystander()
-    assert "Traceback" not in capfd.readouterr().err
 
 
 hosts = st.from_regex(r"[A-Za-z0-9.:@\[\]/\\_-]{0,30}", fullmatch=True)
@@ -268,8 +247,7 @@ def test_the_right_token_always_redirects_to_a_path_of_ours(path):
 
 
 def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
-    gated_server = open_server(ServerOptions(port=0, token=False))
-    try:
+    with closing(open_server(ServerOptions(port=0, token=False))) as gated_server:
         assert both(gated_server, Cookie=None) == (200, 101)
         assert both(gated_server, Cookie=None, Origin="https://evil.example") == (403, 403)
         assert both(gated_server, Cookie=None, Host="evil.example", Origin="http://evil.example") == (
@@ -280,31 +258,15 @@ def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
         assert isinstance(
             decide(AccessRules(token=None), RequestParts("/", [f"localhost:{gated_server.port}"])), Admitted
         )
-    finally:
-        gated_server.close()
 
 
 def test_a_server_on_all_addresses_accepts_its_addresses_and_no_foreign_name():
-    gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
-    try:
-        for host in ("192.168.1.5", socket.gethostname().lower(), "localhost"):
-            assert both(
-                gated_server, Host=f"{host}:{gated_server.port}", Origin=f"http://{host}:{gated_server.port}"
-            ) == (
-                200,
-                101,
-            ), host
-            assert ask(gated_server, Host=f"{host}:{gated_server.port}", Cookie=None)[0] == 403
-        assert both(
-            gated_server,
-            Host=f"evil.example:{gated_server.port}",
-            Origin=f"http://evil.example:{gated_server.port}",
-        ) == (
-            403,
-            403,
-        )
-    finally:
-        gated_server.close()
+    with closing(open_server(ServerOptions(host="0.0.0.0", port=0))) as gated_server:
+        for host in ("192.168.1.5", socket.gethostname().lower(), "localhost", "evil.example"):
+            place, let_in = f"{host}:{gated_server.port}", host != "evil.example"
+            asked = both(gated_server, Host=place, Origin=f"http://{place}")
+            assert asked == ((200, 101) if let_in else (403, 403)), host
+            assert ask(gated_server, Host=place, Cookie=None)[0] == 403
 
 
 # Past the gate: what an authenticated client may send ----------------------------------------------
@@ -325,11 +287,6 @@ def test_no_client_can_open_the_share_tunnel(gated_server, bystander, caplog):
     assert gated_server.server._share_tunnel is None
     assert set(process.children()) <= children
     assert {thread.name for thread in threading.enumerate() if "unnel" in thread.name} == threads
-    assert all(
-        link.raddr.ip.startswith("127.")
-        for link in process.net_connections(kind="inet")
-        if link.raddr and link.laddr.port == gated_server.port
-    )
     assert not [
         link
         for link in process.net_connections(kind="inet")
@@ -340,29 +297,11 @@ def test_no_client_can_open_the_share_tunnel(gated_server, bystander, caplog):
 
 def test_no_client_can_upload(gated_server, bystander):
     upload = gated_server.server.gui.add_upload_button("upload")
+    known = {"source_component_uuid": upload._impl.uuid, "transfer_uuid": "t"}
+    file = {"filename": "../../etc/passwd", "mime_type": "text/plain", "part_count": 2, "size_bytes": 2**40}
     with client(gated_server) as connection:
-        say(
-            connection,
-            {
-                "type": "FileTransferStartUpload",
-                "source_component_uuid": upload._impl.uuid,
-                "transfer_uuid": "t",
-                "filename": "../../etc/passwd",
-                "mime_type": "text/plain",
-                "part_count": 2,
-                "size_bytes": 2**40,
-            },
-        )
-        say(
-            connection,
-            {
-                "type": "FileTransferPart",
-                "source_component_uuid": upload._impl.uuid,
-                "transfer_uuid": "t",
-                "part_index": 0,
-                "content": b"x" * 1000,
-            },
-        )
+        say(connection, {"type": "FileTransferStartUpload", **known, **file})
+        say(connection, {"type": "FileTransferPart", **known, "part_index": 0, "content": b"x" * 1000})
         Bell(gated_server).rings(connection)
     assert gated_server.server.gui._current_file_upload_states == {}
     upload.remove()
@@ -391,19 +330,13 @@ def packed(**message: object) -> bytes:
 
 MALFORMED = [
     *("a text frame", b"", b"\xc1garbage", bytes(range(256)), msgspec.msgpack.encode([1, 2, 3])),
-    *(
-        packed(),
-        packed(type=7),
-        packed(type=["GuiUpdateMessage"]),
-        packed(type="NoSuchMessage"),
-        packed(type="np"),
-    ),
+    *(packed(), packed(type=7), packed(type=["GuiUpdateMessage"]), packed(type="NoSuchMessage"), packed(type="np")),
     packed(**{name: value for name, value in CAMERA.items() if name != "position"}),
     *(packed(**{**CAMERA, "position": value}) for value in ((1.0, 2.0), "abc", 5)),
     *(packed(**CAMERA, surplus=1), packed(**{**CAMERA, "fov": "wide"})),
     b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6,  # truncated
     b"\x91" * 100_000,  # nested deeper than the stack
-]
+]  # fmt: skip
 
 
 def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystander, capfd):
@@ -419,27 +352,10 @@ def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystande
 
 
 @with_fixtures
-@given(
-    st.recursive(
-        st.none()
-        | st.booleans()
-        | st.integers(-(2**63), 2**63)
-        | st.floats()
-        | st.text(max_size=8)
-        | st.binary(max_size=8),
-        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
-        max_leaves=8,
-    ),
-    st.sampled_from(sorted(KINDS)),
-    st.data(),
-)
+@given(ANY_VALUE, st.sampled_from(sorted(KINDS)), st.data())
 def test_any_message_is_admitted_dropped_or_malformed(value, kind, data):
-    fields = list(KINDS[kind].__struct_fields__)
-    message = {
-        "type": kind,
-        **dict.fromkeys(data.draw(st.lists(st.sampled_from(fields), max_size=9)), value),
-    }
-    check(msgspec.msgpack.encode(message))
+    fields = data.draw(st.lists(st.sampled_from(KINDS[kind].__struct_fields__), max_size=9))
+    check(msgspec.msgpack.encode({"type": kind, **dict.fromkeys(fields, value)}))
 
 
 @with_fixtures

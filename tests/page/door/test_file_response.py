@@ -6,6 +6,7 @@ import gzip
 import os
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,8 @@ LARGE_BYTES = 48 * 2**20
 @pytest.fixture(scope="module")
 def gated_server() -> Iterator[GatedServer]:
     """One server for all tests of this file."""
-    gated_server = open_server(ServerOptions(port=0))
-    yield gated_server
-    gated_server.close()
+    with closing(open_server(ServerOptions(port=0))) as gated_server:
+        yield gated_server
 
 
 @pytest.fixture

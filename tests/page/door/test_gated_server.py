@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import http.client
 import os
 import re
 import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import psutil
@@ -20,32 +21,13 @@ import viser._icons
 import viser._messages
 import viser.infra._infra
 
-from tests.drive.page import page_at
+from tests.drive.knocking import ask, token_of
 from workbench.cli.output import print_addresses
 from workbench.page.door import gated_server as door_module
 from workbench.page.door import listening_socket as listening
 from workbench.page.door import viser_private
-from workbench.page.door.access import cookie_name
-from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.gated_server import ServerOptions, open_server
 from workbench.page.door.listening_socket import ServerError
-
-
-def token_of(gated_server: GatedServer) -> str:
-    return gated_server.url.partition("token=")[2]
-
-
-def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """GET ``path``, unmodified, with the door's cookie."""
-    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
-    cookie = {"Cookie": f"{cookie_name(gated_server.port)}={token_of(gated_server)}"}
-    try:
-        connection.request(
-            "GET", path, headers={**cookie, **{k.replace("_", "-"): v for k, v in headers.items()}}
-        )
-        response = connection.getresponse()
-        return response.status, response.headers, response.read()
-    finally:
-        connection.close()
 
 
 def listening_addresses(port: int) -> set[str]:
@@ -56,20 +38,22 @@ def listening_addresses(port: int) -> set[str]:
     }
 
 
-def a_taken_port() -> tuple[socket.socket, int]:
-    taken = socket.create_server(("127.0.0.1", 0))
-    return taken, taken.getsockname()[1]
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        yield taken.getsockname()[1]
 
 
-def test_it_listens_on_loopback_only_unless_told_otherwise(gated_server):
-    assert ServerOptions().host == "127.0.0.1"
-    assert listening_addresses(gated_server.port) == {"127.0.0.1"}
-    assert gated_server.warning is None and gated_server.addresses() == (gated_server.url,)
+@pytest.mark.parametrize("options", [ServerOptions(port=0), ServerOptions(host="LocalHost", port=0)])
+def test_it_listens_on_loopback_only_unless_told_otherwise(options):
+    with closing(open_server(options)) as gated_server:
+        assert listening_addresses(gated_server.port) == {"127.0.0.1"}
+        assert gated_server.url.startswith(f"http://127.0.0.1:{gated_server.port}/?token=")
+        assert gated_server.warning is None and gated_server.addresses() == (gated_server.url,)
 
 
 def test_all_interfaces_are_opened_only_with_a_token_and_a_warning(capsys):
-    gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
-    try:
+    with closing(open_server(ServerOptions(host="0.0.0.0", port=0))) as gated_server:
         assert listening_addresses(gated_server.port) == {"0.0.0.0"}
         assert gated_server.warning is not None and "0.0.0.0" in gated_server.warning
         assert "0.0.0.0" not in gated_server.url  # no browser can open that
@@ -87,14 +71,8 @@ def test_all_interfaces_are_opened_only_with_a_token_and_a_warning(capsys):
             for url in gated_server.addresses()
         )
         for host in hosts:
-            connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
-            connection.request(
-                "GET",
-                f"/?token={token_of(gated_server)}",
-                headers={"Host": f"{host}:{gated_server.port}", "Connection": "close"},
-            )
-            assert connection.getresponse().status in (200, 303), host
-            connection.close()
+            address = f"/?token={token_of(gated_server)}"
+            assert ask(gated_server, address, Host=f"{host}:{gated_server.port}", Cookie=None)[0] == 303, host
         print_addresses(gated_server.addresses())
         printed = capsys.readouterr().out.splitlines()
         assert [line.split() for line in printed] == [
@@ -102,24 +80,12 @@ def test_all_interfaces_are_opened_only_with_a_token_and_a_warning(capsys):
         ]
         gated_server.renew_token()
         assert all(url.endswith(token_of(gated_server)) for url in gated_server.addresses())
-    finally:
-        gated_server.close()
 
 
 def test_the_hint_for_ssh_leads_to_the_listening_port(gated_server):
     port = gated_server.port
     assert f"-L {port}:127.0.0.1:{port} " in gated_server.ssh_hint
     assert gated_server.ssh_hint.endswith(f"@{socket.gethostname()}")
-
-
-def test_localhost_is_the_address_that_is_printed_and_listened_on():
-    gated_server = open_server(ServerOptions(host="LocalHost", port=0))
-    try:
-        assert listening_addresses(gated_server.port) == {"127.0.0.1"}
-        assert gated_server.url.startswith(f"http://127.0.0.1:{gated_server.port}/?token=")
-        assert gated_server.warning is None and gated_server.addresses() == (gated_server.url,)
-    finally:
-        gated_server.close()
 
 
 def test_a_route_has_a_prefix_of_its_own_and_a_server_without_a_token_has_none_to_renew(gated_server):
@@ -129,14 +95,11 @@ def test_a_route_has_a_prefix_of_its_own_and_a_server_without_a_token_has_none_t
     gated_server.add_route("/recordings/", lambda path, query: (200, "text/plain", b"x"))
     with pytest.raises(ValueError, match="/recordings/"):
         gated_server.add_route("/recordings/", lambda path, query: (200, "text/plain", b"y"))
-    assert get(gated_server, "/recordings/a")[2] == b"x"
-    open_to_all = open_server(ServerOptions(port=0, token=False))
-    try:
-        assert "token" not in open_to_all.url and get(open_to_all, "/")[0] == 200
+    assert ask(gated_server, "/recordings/a")[2] == b"x"
+    with closing(open_server(ServerOptions(port=0, token=False))) as open_to_all:
+        assert "token" not in open_to_all.url and ask(open_to_all, "/")[0] == 200
         with pytest.raises(ValueError, match="no token"):
             open_to_all.renew_token()
-    finally:
-        open_to_all.close()
 
 
 def test_tabs_are_renamed_and_listed_with_their_folds(server: viser.ViserServer) -> None:
@@ -178,37 +141,26 @@ def test_invalid_options_are_refused(options):
     assert ServerOptions(port=65535).port == 65535
 
 
-def test_a_requested_port_that_is_taken_is_an_error_with_advice():
-    taken, port = a_taken_port()
-    with taken, pytest.raises(ServerError, match=f"Port {port} is taken.*--port"):
-        open_server(ServerOptions(port=port))
+def test_a_requested_port_that_is_taken_is_an_error_with_advice(taken_port):
+    with pytest.raises(ServerError, match=f"Port {taken_port} is taken.*--port"):
+        open_server(ServerOptions(port=taken_port))
 
 
-def test_a_taken_default_port_is_replaced_with_a_notice(monkeypatch):
-    taken, port = a_taken_port()
+def test_a_taken_default_port_is_replaced_with_a_notice(taken_port, monkeypatch):
     # 8080 itself may be in use on the test machine.
-    monkeypatch.setattr(listening, "DEFAULT_PORT", port)
-    with taken:
-        gated_server = open_server(ServerOptions(port=port))
-        try:
-            assert gated_server.port != port
-            assert listening_addresses(gated_server.port) == {"127.0.0.1"}
-            assert f":{gated_server.port}/" in gated_server.url
-            assert (
-                gated_server.notice is not None
-                and str(port) in gated_server.notice
-                and str(gated_server.port) in gated_server.notice
-            )
-        finally:
-            gated_server.close()
+    monkeypatch.setattr(listening, "DEFAULT_PORT", taken_port)
+    with closing(open_server(ServerOptions(port=taken_port))) as gated_server:
+        assert gated_server.port != taken_port and f":{gated_server.port}/" in gated_server.url
+        assert listening_addresses(gated_server.port) == {"127.0.0.1"}
+        notice = gated_server.notice
+        assert notice is not None and str(taken_port) in notice and str(gated_server.port) in notice
 
 
 def test_closing_frees_the_port_and_ends_the_thread(gated_server):
     thread = gated_server.server._websock_server._server_thread
-    idle = socket.create_connection(
-        ("127.0.0.1", gated_server.port)
-    )  # as Chromium keeps them: no request yet
-    assert get(gated_server, "/")[0] == 200
+    # As Chromium keeps them: no request yet.
+    idle = socket.create_connection(("127.0.0.1", gated_server.port))
+    assert ask(gated_server, "/")[0] == 200
     gated_server.close()
     gated_server.close()
     assert not thread.is_alive()
@@ -284,69 +236,3 @@ def test_no_server_starts_if_its_gate_is_not_in_effect(monkeypatch):
     )
     with pytest.raises(ServerError, match="is not protected"):
         open_server(ServerOptions(port=0))
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_a_real_browser_opens_the_page_without_errors(gated_server, browser):
-    """The page has one of each thing that its policy could break: blobs, data, workers, wasm, eval."""
-    import numpy as np
-    import trimesh
-    import trimesh.visual
-    import trimesh.visual.material
-
-    server = gated_server.server
-    server.gui.add_markdown("**bold**")
-    server.gui.add_html(
-        "<div id='from-html' style='color: red'>html</div><img id='logo' src='/workbench/logo.svg'>"
-    )
-    server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
-    server.gui.add_uplot(
-        data=(np.arange(3.0), np.arange(3.0)),
-        series=({"label": "t"}, {"label": "y", "stroke": "red"}),
-        aspect=1.0,
-    )
-    box = trimesh.creation.box()
-    box.visual = trimesh.visual.TextureVisuals(
-        uv=np.zeros((len(box.vertices), 2)),
-        material=trimesh.visual.material.PBRMaterial(baseColorTexture=_small_picture()),
-    )
-    server.scene.add_mesh_trimesh("/box", box)
-    server.scene.add_batched_meshes_simple(
-        "/many",
-        *(lambda sphere: (sphere.vertices, sphere.faces))(trimesh.creation.icosphere(subdivisions=3)),
-        batched_wxyzs=np.tile([1.0, 0, 0, 0], (4, 1)),
-        batched_positions=np.arange(12.0).reshape(4, 3),
-        lod="auto",  # simplifies in a wasm worker
-    )
-    server.scene.add_camera_frustum("/frustum", fov=1.0, aspect=1.0, image=np.zeros((8, 8, 3), np.uint8))
-    server.scene.configure_environment_map("city", background=True)
-    connected = threading.Event()
-    server.on_client_connect(lambda client: connected.set())
-
-    with page_at(browser, "about:blank", 640, 480, drawn=True) as (page, complaints):
-        page.on(
-            "requestfailed",
-            lambda request: complaints.append(f"{request.url[:100]} {request.failure}"),
-        )
-        page.goto(gated_server.url, wait_until="domcontentloaded")
-        page.wait_for_selector("#from-html", timeout=60_000)
-        page.wait_for_function("() => document.getElementById('logo').naturalWidth > 0", timeout=60_000)
-        assert connected.wait(60)
-        assert (
-            page.url == f"http://127.0.0.1:{gated_server.port}/"
-        )  # the token is no longer in the address bar
-        assert page.evaluate("document.cookie") == ""  # and no script can read it
-        (cookie,) = page.context.cookies()
-        assert (cookie.get("httpOnly"), cookie.get("sameSite")) == (True, "Strict")
-        # No event marks the last refusal, so give everything this long to load.
-        page.wait_for_timeout(3000)
-        page.reload(wait_until="domcontentloaded")  # with the cookie only
-        page.wait_for_selector("#from-html", timeout=60_000)
-    assert complaints == []
-
-
-def _small_picture():
-    from PIL import Image
-
-    return Image.new("RGB", (4, 4), (200, 30, 30))

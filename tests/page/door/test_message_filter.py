@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -26,9 +27,8 @@ pytestmark = pytest.mark.thorough
 @pytest.fixture(scope="module")
 def gated_server() -> Iterator[GatedServer]:
     """One server for all tests of this file."""
-    gated_server = open_server(ServerOptions(port=0))
-    yield gated_server
-    gated_server.close()
+    with closing(open_server(ServerOptions(port=0))) as gated_server:
+        yield gated_server
 
 
 @pytest.fixture

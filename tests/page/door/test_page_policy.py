@@ -17,7 +17,7 @@ from tests.drive.page import page_at
 from tests.drive.waiting import until
 from workbench.commands import COMMANDS
 from workbench.machine.folders import web_assets_folder
-from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.gated_server import GatedServer
 from workbench.page.door.responses import DIRECTIVES
 from workbench.page.widgets.visitors import PATH, Visitors
 
@@ -27,7 +27,7 @@ def filled(gated_server: GatedServer) -> GatedServer:
     """A page with one of each thing that a policy could break: blobs, data, workers, wasm, frames."""
     server = gated_server.server
     server.gui.add_html(
-        "<div id='from-html' style='color: red'>html</div><img src='/workbench/logo.svg'>"
+        "<div id='from-html' style='color: red'>html</div><img id='logo' src='/workbench/logo.svg'>"
         "<iframe src='/workbench/logo.svg'></iframe>"
     )
     server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
@@ -85,6 +85,29 @@ def test_every_reply_isolates_the_page_and_denies_devices(gated_server):
 
 @pytest.mark.slow
 @pytest.mark.browser
+def test_a_real_browser_opens_the_page_without_errors(filled, browser):
+    with page_at(browser, "about:blank", 640, 480, drawn=True) as (page, complaints):
+        page.on(
+            "requestfailed",
+            lambda request: complaints.append(f"{request.url[:100]} {request.failure}"),
+        )
+        page.goto(filled.url, wait_until="domcontentloaded")
+        page.wait_for_selector("#from-html", timeout=60_000)
+        page.wait_for_function("() => document.getElementById('logo').naturalWidth > 0", timeout=60_000)
+        until(filled.server.get_clients, "the page")
+        assert page.url == f"http://127.0.0.1:{filled.port}/", "the token is no longer in the address bar"
+        assert page.evaluate("document.cookie") == "", "no script can read it"
+        (cookie,) = page.context.cookies()
+        assert (cookie.get("httpOnly"), cookie.get("sameSite")) == (True, "Strict")
+        # No event marks the last refusal, so give everything this long to load.
+        page.wait_for_timeout(3000)
+        page.reload(wait_until="domcontentloaded")  # with the cookie only
+        page.wait_for_selector("#from-html", timeout=60_000)
+    assert complaints == []
+
+
+@pytest.mark.slow
+@pytest.mark.browser
 def test_code_injected_as_html_does_not_run(gated_server, browser):
     attacks = (
         '<img src="/none" onerror="document.title=\'ran\'">',
@@ -117,18 +140,14 @@ def test_code_injected_as_html_does_not_run(gated_server, browser):
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
-    gated_server = open_server(ServerOptions(port=0))
+def test_a_page_whose_token_was_renewed_says_what_to_do(gated_server, browser):
     gated_server.add_channel(PATH, Visitors(gated_server.server, COMMANDS).serve)
-    try:
-        with page_at(browser, gated_server.url) as (page, _):
-            page.wait_for_selector("[data-page]", state="attached")
-            gated_server.renew_token()
-            page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
-            page.goto(gated_server.url, wait_until="domcontentloaded")
-            page.wait_for_selector("canvas", timeout=60_000)
-    finally:
-        gated_server.close()
+    with page_at(browser, gated_server.url) as (page, _):
+        page.wait_for_selector("[data-page]", state="attached")
+        gated_server.renew_token()
+        page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
+        page.goto(gated_server.url, wait_until="domcontentloaded")
+        page.wait_for_selector("canvas", timeout=60_000)
 
 
 @pytest.mark.browser

@@ -15,15 +15,20 @@ from workbench.page.scene.bodies import REMOVAL_DELAY_SECONDS, DrawStyle, SceneV
 from workbench.page.scene.env_grid import lay_out
 
 
+def built(server: viser.ViserServer, num_envs: int, **more: Any) -> tuple[SceneView, Any, Any, Any]:
+    """A drawn table scene: the view, the geometry, the layout, and the poses (num_envs, 4, 7)."""
+    geometry, poses = table_scene(num_envs)
+    layout, view = lay_out(geometry, poses), SceneView(server)
+    view.build(geometry, layout, poses, **more)
+    return view, geometry, layout, poses
+
+
 def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:
     return next(handle for handle in view.handles if part in handle.name)
 
 
 def test_bodies_are_at_their_pose_plus_the_env_offset(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(4)
-    layout = lay_out(geometry, poses)
-    view = SceneView(server)
-    view.build(geometry, layout, poses)
+    view, _, layout, poses = built(server, 4)
     poses[:, 3, :3] += [0.1, 0.2, 0.3]
     poses[2, 3, 3:] = [0, 0, 0, 1]
     view.move(poses, layout, only_env=None)
@@ -33,27 +38,19 @@ def test_bodies_are_at_their_pose_plus_the_env_offset(server: viser.ViserServer)
 
 
 def test_floor_is_drawn_once(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(9)
-    view = SceneView(server)
-    view.build(geometry, lay_out(geometry, poses), poses)
+    view, *_ = built(server, 9)
     assert handle_named(view, "ground").batched_positions.shape == (1, 3)
 
 
 def test_a_single_env_view_sends_one_env_at_the_origin(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(9)
-    layout = lay_out(geometry, poses)
-    view = SceneView(server)
-    view.build(geometry, layout, poses, only_env=5)
+    view, _, layout, poses = built(server, 9, only_env=5)
     np.testing.assert_allclose(handle_named(view, "cube").batched_positions, poses[5:6, 3, :3])
     view.move(poses, layout, only_env=None)
     assert handle_named(view, "cube").batched_positions.shape == (9, 3)
 
 
 def test_an_absent_body_is_omitted_and_hidden_if_no_env_has_it(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(3)
-    layout = lay_out(geometry, poses)
-    view = SceneView(server)
-    view.build(geometry, layout, poses)
+    view, _, layout, poses = built(server, 3)
     poses[1, 3] = np.nan
     view.move(poses, layout, None)
     cube = handle_named(view, "cube")
@@ -81,10 +78,7 @@ def test_a_body_of_one_env_is_not_shown_in_another(server: viser.ViserServer) ->
 
 
 def test_a_reload_keeps_nodes_with_an_unchanged_look(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(4)
-    layout = lay_out(geometry, poses)
-    view = SceneView(server)
-    view.build(geometry, layout, poses)
+    view, _, layout, poses = built(server, 4)
     before = view.handles
     again, _ = table_scene(4)
     blue = replace(again.visuals[4], material=Material((0.0, 0.0, 1.0, 1.0)))
@@ -144,9 +138,7 @@ def test_simplified_meshes_replace_the_finer_ones_with_a_delay(server: viser.Vis
 
 
 def test_hidden_bodies_stay_in_the_browser_and_cleared_ones_do_not(panels: Panels) -> None:
-    geometry, poses = table_scene(2)
-    layout, view = lay_out(geometry, poses), SceneView(panels.server)
-    view.build(geometry, layout, poses)
+    view, geometry, layout, poses = built(panels.server, 2)
     handles = view.handles
     view.hide()
     assert not any(handle.visible for handle in handles) and len(panels.nodes("/envs/")) == len(handles)
@@ -173,9 +165,7 @@ def test_a_scene_without_a_floor_stands_on_a_grid_around_all_envs(panels: Panels
 
 def test_a_new_scene_replaces_the_shapes_of_the_old_one_at_once(panels: Panels) -> None:
     """Only finer or coarser shapes of the same scene overlap for a moment."""
-    geometry, poses = table_scene(2)
-    layout, view = lay_out(geometry, poses), SceneView(panels.server)
-    view.build(geometry, layout, poses)
+    view, geometry, layout, poses = built(panels.server, 2)
     fewer = replace(geometry, visuals=geometry.visuals[:3])
     view.build(fewer, layout, poses)
     assert len(panels.nodes("/envs/")) == len(view.handles) == 3
@@ -185,9 +175,7 @@ def test_a_new_scene_replaces_the_shapes_of_the_old_one_at_once(panels: Panels) 
 
 
 def test_a_body_that_moves_only_in_one_env_moves_there(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(3)
-    layout, view = lay_out(geometry, poses), SceneView(server)
-    view.build(geometry, layout, poses)
+    view, _, layout, poses = built(server, 3)
     for env in (2, 0):
         poses = poses.copy()
         poses[env, 3, 1] += 0.5

@@ -18,8 +18,7 @@ from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
 from workbench.live.env_commands import ShowEnvs, ToggleOnlySelected
 from workbench.live.panels.view_panel import ViewIcons, ViewPanel
-from workbench.page.command import Command
-from workbench.page.commands import ShowCollisions, ShowFrames, ShowFrustums, ToggleTheme
+from workbench.page.commands import ToggleTheme
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.viewpoint import (
@@ -261,38 +260,33 @@ def test_the_selected_env_or_all_envs_are_shown_as_chosen_for_the_task(panels: P
     assert not icons.only_selected
     assert not ViewIcons(panels.server, choice, "push.py").only_selected, "also after the review"
     assert ViewIcons(panels.server, choice, "pick.py").only_selected
-    panels.do(ToggleOnlySelected())
+    panels.ask(ShowEnvs(all_envs=False))
     assert icons.only_selected
-    panels.ask(ShowFrustums(on=False))
-    assert not choice.frustums
-    panels.ask(ShowFrames(on=True))
-    assert choice.frames
+
+
+def test_each_part_of_the_view_is_switched_on_and_off_by_its_icon(panels: Panels) -> None:
+    choice = ViewChoice()
+    icons = ViewIcons(panels.server, choice, "push.py")
+    panels.visitors.do = icons.do
+    icons.draw(running(4))
     assert "Collision shapes" not in panels.html("wb-view-icons"), "the scene has none besides its visuals"
     bare = running(4)
     assert bare.task is not None
     geometry = replace(bare.task.geometry, collisions=bare.task.geometry.visuals[:1])
-    icons.draw(replace(bare, task=replace(bare.task, geometry=geometry)))
-    assert "Collision shapes" in panels.html("wb-view-icons")
-    panels.ask(ShowCollisions(on=True))
-    assert choice.collisions
     view = replace(bare, task=replace(bare.task, geometry=geometry))
-    states: dict[str, Command] = {
-        "Cameras": ShowFrustums(on=True),
-        "Frames": ShowFrames(on=True),
-        "Collision shapes": ShowCollisions(on=True),
-    }
-    for _ in range(2):  # each is switched on, off and on again
-        for name, on in states.items():
+    icons.draw(view)
+
+    def pressed() -> dict[str, bool]:
+        on = {name: panels.button(name).pressed for name in ("Cameras", "Frames", "Collision shapes")}
+        assert on == dict(zip(on, (choice.frustums, choice.frames, choice.collisions), strict=True))
+        return on
+
+    first = pressed()
+    for name in first:
+        for on in (not first[name], first[name]):
+            panels.press(name)
             icons.draw(view)
-            before = panels.button(name)
-            assert before.command is not None and (before.command == on) != before.pressed
-            panels.do(before.command)
-            icons.draw(view)
-            assert panels.button(name).pressed != before.pressed
-            others = [panels.button(one).pressed for one in states if one != name]
-            panels.do(panels.button(name).command or on)
-            icons.draw(view)
-            assert [panels.button(one).pressed for one in states if one != name] == others
+            assert pressed() == {**first, name: on}
     for all_envs in (True, False):
         panels.ask(ShowEnvs(all_envs=all_envs))
         icons.draw(replace(view, settings=replace(view.settings, selected_env=3)))
