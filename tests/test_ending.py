@@ -120,10 +120,39 @@ def test_ctrl_c_waits_for_episodes_that_are_being_written(tmp_path: Path) -> Non
 MAX_EXIT_SECONDS = 2.0
 
 
-def check_exit_on_hung_disk(
-    disk: HungDisk, arguments: tuple[str, ...], what: str, presses: tuple[str, ...]
+LIVE = (TASK.name, "--num-envs", "1", "--env", "render_backend=none", "--no-spare")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("what", "arguments", "calls", "presses"),
+    [
+        pytest.param("open", LIVE, ("stat", "open"), (), id="watching"),
+        pytest.param("open", LIVE, ("pwrite", "fsync"), ("Start or stop recording", "Play"), id="recording"),
+        pytest.param(
+            "open",
+            ("empty.py", *LIVE[1:]),
+            ("write", "rename"),
+            ("Write the minimal task into the empty file",),
+            id="edit",
+        ),
+        pytest.param("review", (".",), ("scandir", "open", "stat"), (), id="library"),
+        pytest.param("start", ("--recordings", "/nowhere/recordings"), ("scandir", "open"), (), id="search"),
+    ],
+)
+def test_ctrl_c_ends_a_page_with_any_disk_hung(
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    what: str,
+    arguments: tuple[str, ...],
+    calls: tuple[str, ...],
+    presses: tuple[str, ...],
 ) -> None:
-    """Start the command, hang the disk, repeat the last of `presses` until a call hangs, and check that Ctrl-C ends it."""
+    """The last of `presses` is repeated until a call hangs."""
+    write(tmp_path, made(4, seed=1), pictures=False)
+    shutil.copy(TASK, tmp_path)
+    (tmp_path / "empty.py").touch()
+    disk = HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls)
     with open_workbench(*arguments, cwd=disk.folder, what=what, env=disk.environment()) as opened:
         if what == "open":
             opened.wait_for_line("loaded|failed", 90)
@@ -141,48 +170,3 @@ def check_exit_on_hung_disk(
             seconds = time.monotonic() - began
             assert gone(processes)
     assert opened.process.returncode == 0 and seconds < MAX_EXIT_SECONDS, opened.lines
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("text", "calls", "presses"),
-    [
-        pytest.param(TASK.read_text(), ("stat", "open"), (), id="watching"),
-        pytest.param(
-            TASK.read_text(), ("pwrite", "fsync"), ("Start or stop recording", "Play"), id="recording"
-        ),
-        pytest.param("", ("write", "rename"), ("Write the minimal task into the empty file",), id="edit"),
-    ],
-)
-def test_ctrl_c_ends_the_live_page_with_any_disk_hung(
-    tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    text: str,
-    calls: tuple[str, ...],
-    presses: tuple[str, ...],
-) -> None:
-    file = tmp_path / "task.py"
-    file.write_text(text)
-    disk = HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls)
-    arguments = (str(file), "--num-envs", "1", "--env", "render_backend=none", "--no-spare")
-    check_exit_on_hung_disk(disk, arguments, "open", presses)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("calls", "what", "arguments"),
-    [
-        pytest.param(("scandir", "open", "stat"), "review", (".",), id="library"),
-        pytest.param(("scandir", "open"), "start", ("--recordings", "/nowhere/recordings"), id="search"),
-    ],
-)
-def test_ctrl_c_ends_a_list_with_any_disk_hung(
-    tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    calls: tuple[str, ...],
-    what: str,
-    arguments: tuple[str, ...],
-) -> None:
-    write(tmp_path, made(4, seed=1), pictures=False)
-    shutil.copy(TASK, tmp_path)
-    check_exit_on_hung_disk(HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls), arguments, what, ())

@@ -25,6 +25,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.reload import cold_restart
+from tests.benchmarks.session_times import seconds_until
 from tests.benchmarks.table import Row, keep
 from tests.drive.page import TASK
 from workbench.app.session import Session
@@ -33,6 +34,7 @@ from workbench.cameras.view import StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
+from workbench.live.view import SessionView
 from workbench.task.description import TaskOptions
 
 BASE: CameraKey = ("sensor", "base_camera")
@@ -50,15 +52,14 @@ class Options:
     """Write a row of the table of benchmarks."""
 
 
-def wait(session: Session, settings: CameraSettings, timeout: float = 120.0) -> None:
+def wait(session: Session, settings: CameraSettings) -> None:
     """Wait until the view has a picture taken from this placement."""
-    deadline, seen = time.monotonic() + timeout, -1
-    while time.monotonic() < deadline:
-        picture = session.view().pictures.get(BASE)
-        if picture is not None and np.allclose(picture.pose[:3], settings.position, atol=1e-6):
-            return
-        seen = session.wait(seen, 0.2)
-    raise SystemExit(f"no picture from {settings.position} arrived within {timeout:.0f} s")
+
+    def shows(view: SessionView) -> bool:
+        picture = view.pictures.get(BASE)
+        return picture is not None and np.allclose(picture.pose[:3], settings.position, atol=1e-6)
+
+    seconds_until(session, shows)
 
 
 def at(start: CameraSettings, k: int) -> CameraSettings:
@@ -71,9 +72,9 @@ def main(options: Options) -> None:
             str(TASK), TaskOptions(num_envs=options.num_envs), recordings=Path(folder) / "recordings"
         )
         try:
-            seen = -1
-            while (camera := session.view().of(StudioView).camera(BASE)) is None:
-                seen = session.wait(seen, 1.0)
+            seconds_until(session, lambda view: view.of(StudioView).camera(BASE) is not None)
+            camera = session.view().of(StudioView).camera(BASE)
+            assert camera is not None
             start = camera.info.settings
             assert start is not None
             session.happen(PagesCounted(1))

@@ -25,6 +25,7 @@ import psutil
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.session_times import seconds_until
 from tests.benchmarks.table import Row, keep
 from tests.drive.page import TASK
 from workbench.app.session import Session
@@ -52,16 +53,6 @@ class Options:
     """Write a row of the table of benchmarks."""
 
 
-def wait(session: Session, reached: Callable[[SessionView], bool], timeout: float = 300.0) -> float:
-    """Wait until `reached`; returns the seconds."""
-    began, seen = time.monotonic(), -1
-    while time.monotonic() < began + timeout:
-        if reached(session.view()):
-            return time.monotonic() - began
-        seen = session.wait(seen, 0.5)
-    raise SystemExit(f"the awaited state was not reached within {timeout:.0f} s")
-
-
 STARTS = {"forked": worker_forks.start, "anew": start_anew}
 """Two ways to start a worker: forked from a process with all imports done, or a new process that imports everything."""
 
@@ -80,7 +71,7 @@ def waits(options: Options) -> dict[str, dict[str, list[float]]]:
 
 def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
     def after(reached: Callable[[SessionView], bool]) -> float:
-        wait(session, reached)
+        seconds_until(session, reached)
         return time.monotonic() - began
 
     with tempfile.TemporaryDirectory() as folder:
@@ -97,7 +88,7 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
             yield "the task's first moment, s", after(lambda view: view.timeline.moments == 1)
             yield "its first picture, s", after(lambda view: bool(view.pictures))
             yield "its first exact picture, s", after(is_exact)
-            wait(session, lambda view: view.vitals.spare_ready)
+            seconds_until(session, lambda view: view.vitals.spare_ready)
             yield "processor until then and until the spare is warm, s", processor()
             yield "memory of both, MB", memory()
             for restarted in ("a restarted worker's, with the spare warm, s", WITHOUT_SPARE):

@@ -18,7 +18,6 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +25,7 @@ import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.session_times import seconds_until
 from tests.drive.page import TASK
 from workbench.app.session import Session
 from workbench.hands.commands import ToggleDriving, ToggleReach
@@ -46,16 +46,6 @@ class Options:
     json: bool = False
 
 
-def wait(session: Session, reached: Callable[[SessionView], object], timeout: float = 120.0) -> float:
-    """Milliseconds until the view is as wanted."""
-    began, seen = time.monotonic(), -1
-    while time.monotonic() - began < timeout:
-        if reached(session.view()):
-            return 1000 * (time.monotonic() - began)
-        seen = session.wait(seen, 0.2)
-    raise SystemExit(f"nothing moved within {timeout:.0f} s")
-
-
 def cube_in(view: SessionView) -> np.ndarray:
     """Pose of the cube in the env."""
     assert view.task is not None and view.step is not None
@@ -72,33 +62,35 @@ def start_over(session: Session) -> None:
     session.do(PauseRun())
     last = session.view().timeline.last
     session.do(ResetAll())
-    wait(session, lambda view: view.timeline.last > last and not view.playing)
+    seconds_until(session, lambda view: view.timeline.last > last and not view.playing)
 
 
 def moved(session: Session, k: int) -> float:
     pose = (0.1, 0.1 + 0.01 * k, 0.2, 1.0, 0.0, 0.0, 0.0)
     session.happen(BodyMoved("cube", (ENV,), pose))
-    return wait(session, lambda view: np.allclose(cube_in(view)[:3], pose[:3], atol=1e-5))
+    return seconds_until(session, lambda view: np.allclose(cube_in(view)[:3], pose[:3], atol=1e-5))
 
 
 def pulled(session: Session, k: int) -> float:
     start_over(session)
     session.do(PlayRun())
-    wait(session, lambda view: view.step is not None and view.step.elapsed_steps[ENV] >= 4)
+    seconds_until(session, lambda view: view.step is not None and view.step.elapsed_steps[ENV] >= 4)
     before = cube_in(session.view())[:3].copy()
     x, y = (float(value) for value in before[:2])
     session.happen(BodyPulled(PullBody("cube", ENV, (0.0, 0.0, 0.0), (x, y, 0.3))))
-    took = wait(session, lambda view: np.abs(cube_in(view)[:3] - before).max() > 1e-4)
+    took = seconds_until(session, lambda view: np.abs(cube_in(view)[:3] - before).max() > 1e-4)
     session.happen(BodyPulled(PullBody()))
     return took
 
 
 def driven(session: Session, k: int) -> float:
-    wait(session, lambda view: view.slider_action is not None and not view.slider_action[ENV, :6].any())
+    seconds_until(
+        session, lambda view: view.slider_action is not None and not view.slider_action[ENV, :6].any()
+    )
     time.sleep(0.4)  # the arm comes to rest
     before = joints_in(session.view()).copy()
     session.happen(Driven(("e" if k % 2 else "q",), 0.0))
-    took = wait(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
+    took = seconds_until(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
     session.happen(Driven((), 0.0))
     return took
 
@@ -106,14 +98,16 @@ def driven(session: Session, k: int) -> float:
 def reached(session: Session, k: int) -> float:
     start_over(session)
     session.do(PlayRun())
-    wait(session, lambda view: view.playing and view.step is not None and view.step.elapsed_steps[ENV] >= 4)
+    seconds_until(
+        session, lambda view: view.playing and view.step is not None and view.step.elapsed_steps[ENV] >= 4
+    )
     view = session.view()
     assert view.task is not None and view.step is not None
     arm = view.task.arms[0].body
     before = joints_in(view).copy()
     x, y, z, *q = map(float, view.step.poses[ENV, view.task.geometry.body_names.index(arm)])
     session.happen(ArmDragged(arm, ENV, (x, y, z + (0.05 if k % 2 else -0.05), *q)))
-    took = wait(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
+    took = seconds_until(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
     session.do(ToggleDriving())
     return took
 
@@ -123,7 +117,7 @@ def main(options: Options) -> None:
         made = TaskOptions(num_envs=options.num_envs, env_kwargs={"control_mode": "pd_ee_delta_pose"})
         session = Session(str(TASK), made, recordings=Path(folder) / "recordings")
         try:
-            wait(session, lambda view: view.step is not None)
+            seconds_until(session, lambda view: view.step is not None)
             session.change(selected_env=ENV, action_source="hold", episode_end="continue")
             start_over(session)
             took = {"move_ms": [moved(session, k) for k in range(options.times)]}
@@ -135,6 +129,7 @@ def main(options: Options) -> None:
             took["key_ms"] = [driven(session, k) for k in range(options.times)]
         finally:
             session.close()
+    took = {name: [1000 * seconds for seconds in values] for name, values in took.items()}
     medians = {name: round(statistics.median(values), 1) for name, values in took.items()}
     if options.json:
         print(json.dumps(medians))

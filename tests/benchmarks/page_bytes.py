@@ -31,6 +31,7 @@ from websockets.asyncio.client import connect
 sys.path.append(str(Path(__file__).parents[2]))
 from tests.benchmarks.table import Row, keep
 from tests.drive.far_line import FarLine, line_to
+from tests.drive.page import TASK
 from tests.drive.panels import Clock
 from tests.drive.scripted import ScriptedWorker, no_success
 from tests.drive.session import wait_until
@@ -47,7 +48,6 @@ from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import Stepped, TaskDescription, TaskOptions
 from workbench.task.open import open_task
 
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 HERTZ, SPEED, EPISODE = 30, 4.0, 50
 DELAY_SECONDS = 0.01
 """One-way delay of the connection."""

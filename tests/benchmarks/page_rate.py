@@ -43,19 +43,12 @@ import tyro
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.drive.page import launch, new_page, open_workbench, with_empty_settings
+from tests.drive.page import PRETEND_GPU_JS, TASK, launch, new_page, open_workbench, with_empty_settings
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 NO_DRAWING = """
 for (const name of ['drawElements', 'drawArrays', 'drawElementsInstanced', 'drawArraysInstanced'])
     WebGL2RenderingContext.prototype[name] = function () {};
-"""
-PRETEND_GPU = """
-const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
-WebGL2RenderingContext.prototype.getParameter = function (what) {
-    return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
-};
 """
 COUNT_DRAWN = """
 window.drawnFrames = 0;
@@ -121,7 +114,7 @@ def prepare(page: Page, options: Options, url: str) -> None:
     if options.draw in ("none", "page"):
         page.add_init_script(NO_DRAWING)
     if options.draw == "as-with-a-card":
-        page.add_init_script(PRETEND_GPU)
+        page.add_init_script(PRETEND_GPU_JS)
     page.add_init_script(COUNT_DRAWN)
     page.goto(url)
     expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)

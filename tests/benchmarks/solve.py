@@ -105,10 +105,7 @@ def measure(env_id: str, options: Options) -> dict[str, float]:
 
         return plan
 
-    sides: dict[str, Callable[[], None]] = {
-        "bare": bare,
-        **{side: plan_with(side) for side in planners},
-    }
+    sides: dict[str, Callable[[], None]] = {"bare": bare, **{side: plan_with(side) for side in planners}}
     step = rolled.step
     rolled.step = lambda action: tried.append(action.clone()) or step(action)  # type: ignore[method-assign, assignment]
     sides["exact"]()

@@ -5,12 +5,9 @@
 Runs ``workbench open`` on a task that misbehaves on demand (`tests/live/hazards.py`), in a real Chromium, with a warm
 spare worker. A single step triggers each way. Until the task is back, a control of the page (*next env*) is used
 repeatedly, and the time until the page shows the next env is measured inside the page. A worker that ignores *Interrupt*
-is ended by *Restart*. *Back* is the time from the death of the process (or the click) until the page says that the last
-good version is back, or that the task was interrupted.
-
-A round trip has two parts. The *answer* is the time from the message on the page's websocket until the changed value
-arrives there: server and network. The rest is the browser's own time; here it has no GPU, and shares the cores with the
-server, the worker and this script.
+is ended by *Restart*. *Back* is the time from the death of the process (or the click) until another worker has the task
+paused, or the page says that the task was interrupted. The browser has no GPU, and shares the cores with the server, the
+worker and this script.
 """
 
 from __future__ import annotations
@@ -38,47 +35,14 @@ from workbench.machine.doctor import find_chromium, how_to_get_chromium
 HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native": "Restart"}
 DEATHS = ("exit", "segfault", "abort", "kill", "children", "memory")
 OTHERS = ("flood", "read")
-SOCKET_TIMES = """
-// viser's page creates its websocket in a worker from source text; this code is prepended to that text.
-const inWorker = () => {
-    const told = new BroadcastChannel('socket times'), now = () => performance.timeOrigin + performance.now();
-    const Socket = self.WebSocket, post = self.postMessage.bind(self);
-    let arrived = 0;
-    self.WebSocket = class extends Socket {
-        constructor(...all) { super(...all); this.addEventListener('message', () => { arrived = now(); }); }
-        send(message) { told.postMessage({sent: now()}); super.send(message); }
-    };
-    self.postMessage = (message, moved) => {
-        const changed = message.type === 'message_batch' && message.messages
-            .some((m) => m.type === 'GuiUpdateMessage' && typeof m.updates.value === 'number');
-        if (changed) told.postMessage({arrived});
-        post(message, moved);
-    };
-};
-const Plain = window.Blob;
-window.Blob = class extends Plain {
-    constructor(parts, options) {
-        const socket = (parts ?? []).some((part) => typeof part === 'string' && part.includes('new WebSocket'));
-        super(socket ? [`(${inWorker})();`, ...parts] : parts, options);
-    }
-};
-window.socketTimes = [];
-new BroadcastChannel('socket times').onmessage = (event) => window.socketTimes.push(event.data);
-"""
 NEXT_ENV = """async () => {
-    const shown = () => [...document.querySelectorAll('input')].map((i) => i.value).join('|');
-    const before = shown(), start = performance.now(), origin = performance.timeOrigin;
-    window.socketTimes.length = 0;
-    [...document.querySelectorAll('button')].find((b) => b.innerText.trim() === 'next ›').click();
-    const wait = () => new Promise((done) => setTimeout(done, 2));
-    while (shown() === before && performance.now() - start < 10000) await wait();
-    const end = performance.now();
-    const sent = () => window.socketTimes.find((time) => time.sent > origin + start)?.sent;
-    const arrived = () => window.socketTimes.find((time) => time.arrived > sent())?.arrived;
-    // The times arrive on a separate channel, which may be slower.
-    while (!arrived() && performance.now() - end < 1000) await wait();
-    return [end - start, arrived() ? arrived() - sent() : null];
+    const shown = () => document.querySelector('.wb-timeline').innerText.match(/env \\d+/)?.[0];
+    const before = shown(), start = performance.now();
+    document.querySelector('[role=button][aria-label="Next env"]').click();
+    while (shown() === before && performance.now() - start < 10000) await new Promise((done) => setTimeout(done, 2));
+    return performance.now() - start;
 }"""
+"""Returns the milliseconds from a press on *Next env* until the page shows that env."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +53,6 @@ class Options:
     """File for a screenshot of the banner of the first way that hangs."""
     write: bool = False
     """Write a row of the table of benchmarks."""
-
-
-@dataclass(frozen=True)
-class Trip:
-    """Times of one press, in ms."""
-
-    whole: float
-    answer: float | None
-    """The part between the page's websocket and the server; None if it was not observed."""
 
 
 @dataclass
@@ -113,16 +68,24 @@ class Desk:
     def says(self, text: str) -> bool:
         return text in self.page.evaluate("() => document.body.textContent")
 
+    def is_back(self, before: psutil.Process) -> bool:
+        """Whether another worker than `before` has the task, paused."""
+        workers = self.workers()
+        paused = self.page.evaluate(
+            "() => /\\bpaused\\b/.test(document.querySelector('.wb-status').innerText)"
+        )
+        return paused and bool(workers) and workers[0] != before
+
     def click(self, name: str) -> None:
         self.page.get_by_role("button", name=name, exact=True).click()
 
-    def poke_until(self, reached: Callable[[], bool], trips: list[Trip], timeout: float = 90.0) -> float:
+    def poke_until(self, reached: Callable[[], bool], trips: list[float], timeout: float = 90.0) -> float:
         """Use the control until `reached`; returns the seconds."""
         start = time.perf_counter()
         while not reached():
             if time.perf_counter() - start > timeout:
                 raise TimeoutError(page_text(self.page)[:1000])
-            trips.append(Trip(*self.page.evaluate(NEXT_ENV)))
+            trips.append(self.page.evaluate(NEXT_ENV))
             time.sleep(0.05)
         return time.perf_counter() - start
 
@@ -134,8 +97,8 @@ def page_text(page: Page) -> str:
 
 def one_way(desk: Desk, way: str) -> tuple[str, float]:
     """Trigger one way and wait for the task; returns the line to print, and the seconds until the task was back."""
-    desk.poke_until(lambda: desk.says("the spare worker") and not desk.says("being warmed up"), [], 180.0)
-    worker, trips = desk.workers()[0], []
+    desk.poke_until(lambda: desk.says("the spare worker") and not desk.says("warming up"), [], 180.0)
+    worker, trips = desk.workers()[0], list[float]()
     usage = desk.server.cpu_times()
     provoke(desk.file, "evaluate", way)
     desk.click("Step")
@@ -148,11 +111,11 @@ def one_way(desk: Desk, way: str) -> tuple[str, float]:
             desk.page.screenshot(path=desk.options.screenshot, type="jpeg", quality=82)
         desk.click("Interrupt")
         if HANGS[way] == "Restart":
-            deaf = desk.poke_until(lambda: desk.says("was interrupted and continues"), trips)
+            deaf = desk.poke_until(lambda: desk.says("did not stop when it was interrupted"), trips)
             outcome += f"deaf after {deaf:.1f} s; "
             calm(desk.file)
             desk.click("Restart")
-            back = desk.poke_until(lambda: desk.says("is restored where it was"), trips)
+            back = desk.poke_until(lambda: desk.is_back(worker), trips)
         else:
             back = desk.poke_until(lambda: desk.says("was interrupted in evaluate"), trips)
         outcome += f"{HANGS[way]}"
@@ -160,9 +123,9 @@ def one_way(desk: Desk, way: str) -> tuple[str, float]:
         dying = desk.poke_until(lambda: not worker.is_running() or worker.status() == "zombie", trips)
         outcome = f"dead after {dying:.1f} s"
         calm(desk.file)
-        back = desk.poke_until(lambda: desk.says("is restored where it was"), trips)
+        back = desk.poke_until(lambda: desk.is_back(worker), trips)
     else:
-        word = "EOFError" if way == "read" else "came too fast to be kept"
+        word = "EOFError" if way == "read" else "they came too fast"
         back = desk.poke_until(lambda: desk.says(word) and "busy" not in page_text(desk.page), trips)
         if way == "flood":
             # The task removes the provocation file when it ends, and would remove that of the next way.
@@ -174,8 +137,7 @@ def one_way(desk: Desk, way: str) -> tuple[str, float]:
     desk.click("Step")
     time.sleep(1.0)
     line = (
-        f"| {way} | {outcome} | {back:.2f} | {median_and_worst([trip.whole for trip in trips])} "
-        f"| {median_and_worst([trip.answer for trip in trips if trip.answer is not None])} "
+        f"| {way} | {outcome} | {back:.2f} | {median_and_worst(trips)} "
         f"| {len(trips)} | {cpu:.1f} | {memory:.0f} |"
     )
     return line, back
@@ -195,7 +157,7 @@ def main(options: Options) -> None:
         arguments = (str(file), "--num-envs", str(options.num_envs), "--memory-limit", "3GB")
         with open_workbench(*arguments, cwd=Path(name)) as opened, sync_playwright() as playwright:
             page, _ = new_page(launch(playwright, chromium))
-            page.add_init_script(NO_DRAWING + SOCKET_TIMES)
+            page.add_init_script(NO_DRAWING)
             page.goto(opened.url)
             expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(
                 timeout=120_000
@@ -204,11 +166,8 @@ def main(options: Options) -> None:
             page.get_by_role("tab", name="Run").click()
             desk = Desk(page, file, psutil.Process(opened.process.pid), options)
             print(f"{options.num_envs} envs; round trips in ms, CPU of the server in s, its memory in MB")
-            print(
-                "| way | what happened | back after s | trip median | worst | answer median | worst "
-                "| trips | CPU | memory |"
-            )
-            print("|" + "---|" * 10, flush=True)
+            print("| way | what happened | back after s | trip median | worst | trips | CPU | memory |")
+            print("|" + "---|" * 8, flush=True)
             slowest = 0.0
             for way in options.ways:
                 line, back = one_way(desk, way)

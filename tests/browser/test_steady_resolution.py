@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
 
+from tests.drive.page import PRETEND_GPU_JS
 from tests.drive.scenes import table_scene
 from tests.drive.waiting import until
 from workbench.commands import COMMANDS
@@ -22,12 +23,6 @@ from workbench.page.scene.software_rendering import InSoftware
 from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-GPU_JS = """
-const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
-WebGL2RenderingContext.prototype.getParameter = function (what) {
-    return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
-};
-"""
 SLOW_FRAMES_JS = """
 const soon = window.requestAnimationFrame.bind(window);
 let last = 0;
@@ -97,7 +92,7 @@ def test_a_software_rendered_page_keeps_its_resolution_with_slow_frames(
 
 
 def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(gated_server: GatedServer, show: Show) -> None:
-    page = show(GPU_JS, SLOW_FRAMES_JS)
+    page = show(PRETEND_GPU_JS, SLOW_FRAMES_JS)
     assert width(page) == 2 * 640
     draw_until(gated_server, page, f"{CANVAS}.width < {2 * 640}")
     page.close()
@@ -139,7 +134,7 @@ def test_meshes_are_simplified_only_while_every_page_uses_software_rendering(
     until(lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 0, "simpler shapes")
     assert in_software.looks(DrawStyle(), geometry, layout, alone=True) == DrawStyle()
     assert in_software.looks(DrawStyle(1_000_000), geometry, layout, alone=False).error == 0
-    other = show(GPU_JS)
+    other = show(PRETEND_GPU_JS)
     until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
     assert in_software.all_pages
     until(lambda: not in_software.all_pages, "the timeout of the other page's report")

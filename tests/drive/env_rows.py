@@ -22,10 +22,7 @@ def rows_of(**changes: object) -> EnvRows:
         "end": np.array([-1, 33, 20, 50, -1, -1], np.int32),
         "total": np.array([1.0, 20.0, 5.0, math.nan, 0.5, 3.0]),
         "followed": np.array([True, True, True, False, True, True]),
-        "first": {
-            "success": np.array([-1, 33, -1, -1, -1, -1]),
-            "near": np.array([1, 20, -1, 7, -1, 0]),
-        },
+        "first": {"success": np.array([-1, 33, -1, -1, -1, -1]), "near": np.array([1, 20, -1, 7, -1, 0])},
         "rewards": rewards,
         "outliers": {5: (FELL,)},
         "by_hand": np.zeros(6, bool),

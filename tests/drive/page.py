@@ -50,6 +50,12 @@ CHROMIUM_ARGUMENTS = (
 )
 START_SECONDS = 60.0
 expect.set_options(timeout=60_000)
+PRETEND_GPU_JS = """
+const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
+WebGL2RenderingContext.prototype.getParameter = function (what) {
+    return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
+};
+"""
 DRAW_ON_REQUEST_JS = """
 [window.viewIsSeen, window.drawnInView] = [false, 0];
 for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
