@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
-ORDER = (
+ORDER: list[str] = (
     "machine envs pictures source task jobs planning episodes actions page trust live record cameras checks hands library"
     " review rescore solve share sweep start app cli"
 ).split()

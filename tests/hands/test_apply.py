@@ -120,7 +120,7 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
     def refuse(*wrong: Any) -> None:
         for one in wrong:
             with pytest.raises(Refused):
-                (fake.session.do if isinstance(one, Command) else fake.session.happen)(one)
+                fake.session.do(one) if isinstance(one, Command) else fake.session.happen(one)
         assert hands(fake) == before
         assert not fake.asked(MoveJoints | MoveBody | PullBody | ReachPose | SetSliderAction)  # type: ignore[arg-type]
 
