@@ -18,10 +18,37 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
-ORDER: list[str] = (
-    "machine envs pictures source task jobs planning episodes actions page trust live record cameras checks hands library"
-    " review rescore solve share sweep start app cli"
-).split()
+ORDER: tuple[str, ...] = (
+    *(
+        "machine",
+        "envs",
+        "pictures",
+        "source",
+        "task",
+        "jobs",
+        "planning",
+        "episodes",
+        "actions",
+        "page",
+        "trust",
+        "live",
+    ),
+    *(
+        "record",
+        "cameras",
+        "checks",
+        "hands",
+        "library",
+        "review",
+        "rescore",
+        "solve",
+        "share",
+        "sweep",
+        "start",
+        "app",
+    ),
+    "cli",
+)
 """The folders, as the architecture page draws them: each imports only those before it."""
 
 
