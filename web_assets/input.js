@@ -532,6 +532,8 @@
   }, true);
   addEventListener("change", ({ target }) => {
     if (!target.dataset?.field || ("live" in target.dataset && !target.dataset.done)) return;
+    // An arrow key has sent this value already: sent again, it could undo a change that was made since.
+    if (target.matches(TYPED_INTO) && !edited.has(target)) return;
     typed(target);
     if (byPointer && !target.matches(TYPED_INTO)) target.blur();
   }, true);
