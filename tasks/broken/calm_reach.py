@@ -1,4 +1,4 @@
-"""Reach a marker on a short way: a small task with one mistake, to find and to mend.
+"""Reach a marker on a short way: a small task with one mistake to find and to fix.
 
 Something is wrong here: workbench check says what.
 """

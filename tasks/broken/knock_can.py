@@ -1,4 +1,4 @@
-"""Knock over a can: a small task with one mistake, to find and to mend.
+"""Knock over a can: a small task with one mistake to find and to fix.
 
 Something is wrong here: workbench check says what.
 """

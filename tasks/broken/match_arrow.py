@@ -1,4 +1,4 @@
-"""Point the hand along an arrow: a small task with one mistake, to find and to mend.
+"""Point the hand along an arrow: a small task with one mistake to find and to fix.
 
 Something is wrong here: workbench check says what.
 """

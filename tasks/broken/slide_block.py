@@ -1,4 +1,4 @@
-"""Slide a block over a line: a small task with one mistake, to find and to mend.
+"""Slide a block over a line: a small task with one mistake to find and to fix.
 
 Something is wrong here: workbench check says what.
 """

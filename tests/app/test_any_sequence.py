@@ -49,7 +49,7 @@ def places(fake: FakeWorkerSession) -> None:
     camera = fake.view.of(StudioView).camera(BASE)
     if camera is not None and camera.now is not None:
         x, y, z = camera.now.position
-        fake.session.happen(CameraPlaced(BASE, replace(camera.now, position=(x + 0.1, y, z))))
+        fake.session.dispatch(CameraPlaced(BASE, replace(camera.now, position=(x + 0.1, y, z))))
 
 
 def undoes(fake: FakeWorkerSession) -> None:
@@ -79,7 +79,7 @@ COMMANDS = st.one_of(
     act("undo", lambda fake: fake.session.do(UndoReset())),
     act("go on from here", lambda fake: fake.session.do(ContinueFromHere(scope="all"))),
     st.integers(-20, 20).map(lambda by: (f"{by} along", lambda fake: seek_by(fake.session, by))),
-    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda fake: fake.session.happen(MomentShown(at)))),
+    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda fake: fake.session.dispatch(MomentShown(at)))),
     st.integers(-1, 5).map(lambda env: (f"select {env}", lambda fake: fake.session.change(selected_env=env))),
     act(
         "watch a camera",

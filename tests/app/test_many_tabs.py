@@ -56,10 +56,10 @@ class CountingSession(Session):
             str(folder / "push.py"), options, recordings=folder / "recordings", make_worker=scripted(2)
         )
 
-    def happen(self, event: RunEvent) -> None:
+    def dispatch(self, event: RunEvent) -> None:
         if isinstance(event, PagesCounted):
             self._counts.append(event.count)
-        super().happen(event)
+        super().dispatch(event)
 
 
 @pytest.fixture(scope="module")

@@ -137,8 +137,8 @@ def test_a_reopened_task_has_its_selections_and_camera_edits(desk: Desk) -> None
     now = camera(first, CAMERA).now
     assert now is not None
     placed = replace(now, position=(1.0, 2.0, 3.0))
-    first.happen(CameraPlaced(CAMERA, placed))
-    first.happen(CameraChosen(CAMERA))
+    first.dispatch(CameraPlaced(CAMERA, placed))
+    first.dispatch(CameraChosen(CAMERA))
     desk.choose("pull.py")
     second = desk.session_of("pull.py")
     assert not moved(second.view()) and second.view().selected_env == 0
@@ -161,12 +161,12 @@ def test_a_task_whose_episode_is_being_saved_is_closed_when_the_episode_is_saved
     hold_saving(first)
     first.do(Step())
     wait_until(first, lambda view: view.timeline.moments == 2, "a step")
-    first.happen(SaveWanted((0,)))
-    first.happen(SaveProgressed(1, JobProgress("rendering again", 120, 290)))
+    first.dispatch(SaveWanted((0,)))
+    first.dispatch(SaveProgressed(1, JobProgress("rendering again", 120, 290)))
     desk.choose("pull.py")
     desk.session_of("pull.py")
     until(lambda: "120 of 290" in desk.app.open_task.doing(), "the progress on the page")
-    first.happen(EpisodesSaved(1, "saved"))
+    first.dispatch(EpisodesSaved(1, "saved"))
     desk.idle()
     assert first.saving().unsaved == 0 and desk.app.shared.sessions == {desk.app.shared.home}
 
@@ -177,7 +177,7 @@ def test_the_end_of_the_program_does_not_wait_for_an_episode_that_is_being_saved
     hold_saving(first)
     first.do(Step())
     wait_until(first, lambda view: view.timeline.moments == 2, "a step")
-    first.happen(SaveWanted((0,)))
+    first.dispatch(SaveWanted((0,)))
     desk.choose("pull.py")
     until(lambda: "saving 1 episode" in desk.app.open_task.doing(), "the saving")
     desk.app.finish_saving(0.0)

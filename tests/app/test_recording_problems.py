@@ -44,7 +44,7 @@ def test_a_page_shows_how_many_episodes_a_recording_saved_and_where(
     with websockets.sync.client.connect(address, **how) as connection:
         connection.send(camera_message())
         until(lambda: gated_server.server.get_clients(), "the client")
-        session.happen(RecordingWanted())
+        session.dispatch(RecordingWanted())
         session.do(Step())
         wait_until(session, lambda view: view.of(RecordingStatus).steps == 2, "a step of both envs")
         session.do(StopRecording())
@@ -81,13 +81,13 @@ def test_each_page_shows_a_recording_problem(page: Which, tmp_path: Path, gated_
             return any(str(folder) in text for text in texts) and len(notices) == number
 
         for number in (1, 2):
-            session.happen(RecordingWanted())
+            session.dispatch(RecordingWanted())
             until(lambda number=number: tells(number), "the notice")
         # A momentary refusal is shown too, and not kept afterwards.
         begun = session.view().timeline.moments
-        session.happen(EnvsReset())
+        session.dispatch(EnvsReset())
         wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
-        session.happen(SaveWanted(before=True))
+        session.dispatch(SaveWanted(before=True))
         assert session.view().of(RecordingStatus).saving.failed
         session.do(Step())
         wait_until(session, lambda view: not view.of(RecordingStatus).saving.message, "the message's end")

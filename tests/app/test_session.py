@@ -74,7 +74,7 @@ def test_the_counter_of_changes_counts_only_changes(tmp_path: Path) -> None:
         before = session.wait(-1, 0.0)
         session.change()
         assert session.wait(before, 0.0) == before
-        session.happen(PagesCounted(3))
+        session.dispatch(PagesCounted(3))
         assert session.wait(before, 0.0) != before
 
 

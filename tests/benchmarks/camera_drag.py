@@ -77,14 +77,14 @@ def main(options: Options) -> None:
             assert camera is not None
             start = camera.info.settings
             assert start is not None
-            session.happen(PagesCounted(1))
+            session.dispatch(PagesCounted(1))
             session.change(cameras=(CameraRequest("base_camera", "sensor"),))
             wait(session, start)
             single = []
             for k in range(options.placements):
                 time.sleep(0.1)
                 began = time.perf_counter()
-                session.happen(CameraPlaced(BASE, at(start, k)))
+                session.dispatch(CameraPlaced(BASE, at(start, k)))
                 wait(session, at(start, k))
                 single.append(time.perf_counter() - began)
             first = session.view().pictures_serial
@@ -92,7 +92,7 @@ def main(options: Options) -> None:
             began = time.perf_counter()
             for k in range(count):
                 time.sleep(max(0.0, began + k / DRAG_HERTZ - time.perf_counter()))
-                session.happen(CameraPlaced(BASE, at(start, 100 + k), control=1))
+                session.dispatch(CameraPlaced(BASE, at(start, 100 + k), control=1))
             last = time.perf_counter()
             wait(session, at(start, 100 + count - 1))
             lag = time.perf_counter() - last

@@ -84,7 +84,7 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
         )
         try:
             session.change(cameras=CAMERAS)
-            session.happen(PagesCounted(1))
+            session.dispatch(PagesCounted(1))
             yield "the task's first moment, s", after(lambda view: view.timeline.moments == 1)
             yield "its first picture, s", after(lambda view: bool(view.pictures))
             yield "its first exact picture, s", after(is_exact)

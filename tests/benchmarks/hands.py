@@ -67,7 +67,7 @@ def start_over(session: Session) -> None:
 
 def moved(session: Session, k: int) -> float:
     pose = (0.1, 0.1 + 0.01 * k, 0.2, 1.0, 0.0, 0.0, 0.0)
-    session.happen(BodyMoved("cube", (ENV,), pose))
+    session.dispatch(BodyMoved("cube", (ENV,), pose))
     return seconds_until(session, lambda view: np.allclose(cube_in(view)[:3], pose[:3], atol=1e-5))
 
 
@@ -77,9 +77,9 @@ def pulled(session: Session, k: int) -> float:
     seconds_until(session, lambda view: view.step is not None and view.step.elapsed_steps[ENV] >= 4)
     before = cube_in(session.view())[:3].copy()
     x, y = (float(value) for value in before[:2])
-    session.happen(BodyPulled(PullBody("cube", ENV, (0.0, 0.0, 0.0), (x, y, 0.3))))
+    session.dispatch(BodyPulled(PullBody("cube", ENV, (0.0, 0.0, 0.0), (x, y, 0.3))))
     took = seconds_until(session, lambda view: np.abs(cube_in(view)[:3] - before).max() > 1e-4)
-    session.happen(BodyPulled(PullBody()))
+    session.dispatch(BodyPulled(PullBody()))
     return took
 
 
@@ -89,9 +89,9 @@ def driven(session: Session, k: int) -> float:
     )
     time.sleep(0.4)  # the arm comes to rest
     before = joints_in(session.view()).copy()
-    session.happen(Driven(("e" if k % 2 else "q",), 0.0))
+    session.dispatch(Driven(("e" if k % 2 else "q",), 0.0))
     took = seconds_until(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
-    session.happen(Driven((), 0.0))
+    session.dispatch(Driven((), 0.0))
     return took
 
 
@@ -106,7 +106,7 @@ def reached(session: Session, k: int) -> float:
     arm = view.task.arms[0].body
     before = joints_in(view).copy()
     x, y, z, *q = map(float, view.step.poses[ENV, view.task.geometry.body_names.index(arm)])
-    session.happen(ArmDragged(arm, ENV, (x, y, z + (0.05 if k % 2 else -0.05), *q)))
+    session.dispatch(ArmDragged(arm, ENV, (x, y, z + (0.05 if k % 2 else -0.05), *q)))
     took = seconds_until(session, lambda view: np.abs(joints_in(view) - before).max() > 1e-4)
     session.do(ToggleDriving())
     return took

@@ -298,7 +298,7 @@ def shoot_checks(browser: Browser) -> None:
     with live_page(browser, "--num-envs", "16", *CONTROL, task=text, checks=True) as desk:
         desk.tab("Checks")
         expect(desk.page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=240_000)
-        desk.page.locator("[data-rule=success-at-reset]").get_by_text("Why, mend").click()
+        desk.page.locator("[data-rule=success-at-reset]").get_by_text("Why, fix").click()
         desk.shoot("checks")
 
 

@@ -42,7 +42,7 @@ def test_a_broken_save_is_found_with_its_line_and_a_fix_clears_the_list(desk: De
     expect(card.locator(".wb-tag")).to_have_text("stop")
     link = card.locator("a.wb-at-line")
     expect(link).to_have_attribute("href", re.compile(rf"push_cube\.py:{line}$"))
-    card.get_by_text("Why, mend").click()
+    card.get_by_text("Why, fix").click()
     expect(card.locator(".wb-check-page")).to_contain_text("Why")
     # The fold stays open while results arrive.
     expect(page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=180_000)

@@ -60,4 +60,4 @@ def test_restart_ends_uninterruptible_work(desk: Desk) -> None:
     desk.button("Restart").click()
     expect(desk.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     desk.timeline_says(where)
-    assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
+    assert desk.opened.wait_for_line("worker failed.*stopped by the user in evaluate")

@@ -42,7 +42,7 @@ def runs() -> tuple[Run, Run, Run]:
         first = fake.session.look(lambda run: run)
         fake.step()
         second = fake.session.look(lambda run: run)
-        fake.session.happen(MomentShown(1, env=PAST_ENV))
+        fake.session.dispatch(MomentShown(1, env=PAST_ENV))
         past = fake.session.look(lambda run: run)
     opened = {"pages": 1, "state": "paused"}
     return replace(first, **opened), replace(second, **opened), replace(past, **opened)

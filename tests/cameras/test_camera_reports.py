@@ -421,7 +421,7 @@ def test_rows_list_the_least_seen_object_first_without_scenery() -> None:
         report_of(seen("cube", [40, 50, 60], unhindered=[80, 50, 60], present=[True, True, False]))
     )
     assert half["bad"] == ["hidden"] and "2 of 3" in half["note"] and half["hidden"] == "25 %"
-    assert half["moods"] == ["good", "good", "none"]
+    assert half["tones"] == ["good", "good", "none"]
     (little,) = object_rows(report_of(seen("cube", [90, 50], unhindered=[100, 50], alone=[100, 90])))
     assert little["bad"] == [] and "behind other objects" in little["note"]
     (absent,) = object_rows(report_of(seen("cube", [0], present=[False])))

@@ -73,11 +73,11 @@ def test_a_texture_that_the_shader_lacks_fails_its_camera(tmp_path: Path) -> Non
         session.change(
             cameras=(CameraRequest(SENSOR[1], "sensor", ("depth",)), CameraRequest(HUMAN[1], "human"))
         )
-        session.happen(PagesCounted(1))
+        session.dispatch(PagesCounted(1))
         view = wait_until(session, lambda v: SENSOR in v.failed_cameras and HUMAN in v.pictures, "both")
         assert f"{file}:{line}" in view.failed_cameras[SENSOR] and [*view.failed_cameras] == [SENSOR]
         # The recording leaves this camera out.
-        session.happen(RecordingWanted())
+        session.dispatch(RecordingWanted())
         step(session, 3)
         wait_until(session, lambda v: v.of(RecordingStatus).steps > 0, "recorded steps")
         session.do(StopRecording())
@@ -97,7 +97,7 @@ def test_a_picture_that_hangs_fails_its_camera(tmp_path: Path) -> None:
     file = task(tmp_path, HANGS)
     with live_session(file, tmp_path / "recordings", draw=True, render_backend=RENDER_BACKEND) as session:
         session.change(cameras=(CameraRequest(HUMAN[1], "human"),))
-        session.happen(PagesCounted(1))
+        session.dispatch(PagesCounted(1))
         view = wait_until(session, lambda v: HUMAN in v.failed_cameras, "the camera's failure")
         assert any(HUMAN[1] in line and str(file) in line for line in view.printed.texts)
         wait_until(session, lambda v: v.state == "paused", "the next worker")

@@ -69,7 +69,7 @@ class Desk:
 def desk(scripted_session: Callable[..., Session], panels: Panels, request: pytest.FixtureRequest) -> Desk:
     info = replace(camera(), settings=request.param)
     session, two_handles = scripted_session(1, camera=info), [False]
-    session.happen(CameraChosen(info.key))
+    session.dispatch(CameraChosen(info.key))
     numbers = CameraNumbers(panels.server, Placing(session), look_at=lambda: two_handles[0])
     panels.visitors.do = numbers.do
     desk = Desk(session, numbers, panels, two_handles)

@@ -78,14 +78,14 @@ def looks_at(fake: FakeWorkerSession) -> object:
 
 def test_a_placement_is_sent_to_the_worker_once(one: FakeWorkerSession) -> None:
     session = one.session
-    session.happen(CameraPlaced(BASE, MOVED))
-    session.happen(CameraPlaced(BASE, MOVED))
+    session.dispatch(CameraPlaced(BASE, MOVED))
+    session.dispatch(CameraPlaced(BASE, MOVED))
     assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)]
     assert moved(one.view) == {BASE} and now(one) == MOVED
     for command, settings in ((UndoCamera(), None), (RedoCamera(), MOVED), (PutMovedCamerasBack(), None)):
         session.do(command)
         assert one.asked(PlaceCamera) == [PlaceCamera(BASE, settings)]
-    session.happen(CameraPlaced(NOTHING, MOVED))
+    session.dispatch(CameraPlaced(NOTHING, MOVED))
     assert (
         one.asked(PlaceCamera) == []
         and "there is no sensor camera nothing" in one.view.of(StudioView).problem
@@ -94,7 +94,7 @@ def test_a_placement_is_sent_to_the_worker_once(one: FakeWorkerSession) -> None:
 
 def test_after_a_failed_placement_the_previous_one_is_sent_once(one: FakeWorkerSession) -> None:
     for height in (0.7, 0.8):
-        one.session.happen(CameraPlaced(BASE, at(height)))
+        one.session.dispatch(CameraPlaced(BASE, at(height)))
         one.asked(object)
         one.tell(Placed(BASE, at(height), None, why_not="it is far away"))
         assert (
@@ -109,10 +109,10 @@ def test_placements_are_sent_to_each_new_version_and_worker_until_the_file_chang
     one: FakeWorkerSession,
 ) -> None:
     session = one.session
-    session.happen(CameraChosen(BASE))
-    session.happen(CameraPlaced(NOTHING, MOVED))
+    session.dispatch(CameraChosen(BASE))
+    session.dispatch(CameraPlaced(NOTHING, MOVED))
     assert one.view.of(StudioView).problem
-    session.happen(CameraPlaced(BASE, MOVED))
+    session.dispatch(CameraPlaced(BASE, MOVED))
     for level in ("patched", "rebuilt", None):
         one.asked(object)
         loaded(one, level=level)
@@ -216,15 +216,15 @@ def test_an_undone_step_can_be_redone_until_another_change(one: FakeWorkerSessio
         with pytest.raises(Refused):
             session.do(command)
     assert labels() == (None, None)
-    session.happen(CameraPlaced(BASE, at(0.7), DRAG))
+    session.dispatch(CameraPlaced(BASE, at(0.7), DRAG))
     assert labels() == ("moved base_camera", None)
     session.do(UndoCamera())
     assert labels() == (None, "moved base_camera") and now(one) == FILE
     session.do(RedoCamera())
-    session.happen(CameraPlaced(BASE, at(0.8), DRAG))
+    session.dispatch(CameraPlaced(BASE, at(0.8), DRAG))
     session.do(UndoCamera())
     assert now(one) == at(0.7), "a drag after a redo must be a new step"
-    session.happen(CameraPlaced(BASE, at(0.9)))
+    session.dispatch(CameraPlaced(BASE, at(0.9)))
     with pytest.raises(Refused):
         session.do(RedoCamera())
     assert now(one) == at(0.9) and labels() == ("moved base_camera", None)
@@ -243,14 +243,14 @@ def test_a_moved_camera_keeps_its_distance_and_a_restored_one_the_files_target(
     one: FakeWorkerSession,
 ) -> None:
     session = one.session
-    session.happen(CameraPlaced(BASE, replace(FILE, distance=0.2)))
+    session.dispatch(CameraPlaced(BASE, replace(FILE, distance=0.2)))
     assert now(one).distance == 0.2 and not moved(one.view) and one.view.of(StudioView).undo is None, (
         "a new distance alone is not a placement"
     )
-    session.happen(CameraPlaced(BASE, FILE))
-    session.happen(CameraPlaced(BASE, MOVED))
+    session.dispatch(CameraPlaced(BASE, FILE))
+    session.dispatch(CameraPlaced(BASE, MOVED))
     assert looks_at(one) == (0.08, 0.3, 0.2)
-    session.happen(CameraPlaced(BASE, replace(MOVED, distance=2.0)))
+    session.dispatch(CameraPlaced(BASE, replace(MOVED, distance=2.0)))
     assert now(one).distance == 2.0
     session.do(UndoCamera())
     assert looks_at(one) == TARGET and not moved(one.view), "a new distance alone is not a step of undo"
@@ -263,7 +263,7 @@ def test_without_a_target_in_the_file_the_ground_sets_the_distance(
 ) -> None:
     loaded(fake, BARE)
     assert looks_at(fake) == (-0.105, 0, 0)
-    fake.session.happen(CameraPlaced(BASE, replace(now(fake), position=(0.45, 0.0, 0.9))))
+    fake.session.dispatch(CameraPlaced(BASE, replace(now(fake), position=(0.45, 0.0, 0.9))))
     assert looks_at(fake) == (-0.105, 0, 0.3)
     loaded(fake, replace(BARE, position=(0.45, 0.0, 0.9)), "cameras")
     assert looks_at(fake) == (-0.105, 0, 0.3) and not moved(fake.view), (
@@ -310,7 +310,7 @@ def with_file(tmp_path: Path) -> Iterator[tuple[FakeWorkerSession, Path]]:
 
 def plan_waiting_for_worker(fake: FakeWorkerSession) -> Call:
     """Request a plan and return its question to the worker, for whose answer the plan waits."""
-    fake.session.happen(EditWanted(EditRequest("add", ("human", "side"), FILE)))
+    fake.session.dispatch(EditWanted(EditRequest("add", ("human", "side"), FILE)))
     found: list[Any] = []
 
     def asked() -> bool:
@@ -326,14 +326,14 @@ def test_closing_a_session_ends_waiting_plans_and_starts_no_more(
 ) -> None:
     told, file = with_file
     plan_waiting_for_worker(told)
-    told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))  # queued
+    told.session.dispatch(EditWanted(EditRequest("edit", BASE, MOVED)))  # queued
     closing = threading.Thread(target=told.session.close)
     closing.start()
     closing.join(20)
     assert not closing.is_alive(), "the close waits for an answer that never comes"
     state = told.view.of(StudioView).edit_state
     assert state.stage == "refused" and state.request is not None and state.request.what == "add"
-    told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))
+    told.session.dispatch(EditWanted(EditRequest("edit", BASE, MOVED)))
     assert told.asked(Call) == [] and told.view.of(StudioView).edit_state == state
 
 
@@ -356,13 +356,13 @@ def test_closing_a_session_leaves_no_thread(tmp_path: Path) -> None:
     with opened(tmp_path) as (told, _):
         session = told.session
         plan_waiting_for_worker(told)
-        session.happen(PagesCounted(1))
-        session.happen(CameraChosen(BASE))
+        session.dispatch(PagesCounted(1))
+        session.dispatch(CameraChosen(BASE))
         session.do(ScalePreview(scale=0.5))
         session.do(PickPixel(x=0.5, y=0.5))
         calls: list[Call] = []
         until(lambda: calls.extend(told.asked(Call)) or len(calls) == 2, "both questions")
-        session.happen(RecordingWanted())
+        session.dispatch(RecordingWanted())
         told.reset()
         told.step(2)
         assert len(set(threading.enumerate()) - before) >= 5

@@ -84,8 +84,8 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
     try:
         wait_until(session, lambda view: view.task is not None, "the first load")
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
-        session.happen(CameraPlaced(BASE, there))
-        session.happen(EditWanted(EditRequest("edit", BASE)))
+        session.dispatch(CameraPlaced(BASE, there))
+        session.dispatch(EditWanted(EditRequest("edit", BASE)))
         refused = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
         session.do(CopyTask())
         planned = wait_until(
@@ -109,8 +109,8 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
     # Small pictures: only the camera's pose matters.
     task_file.write_text(text.replace("512", "64"))
     session.do(PutMovedCamerasBack())
-    session.happen(PagesCounted(1))
-    session.happen(FileOpened(task_file, "PushCubeEnv"))
+    session.dispatch(PagesCounted(1))
+    session.dispatch(FileOpened(task_file, "PushCubeEnv"))
     wait_until(session, lambda view: view.task.file == str(task_file), "the example")
     session.change(cameras=(CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
     return session
@@ -120,10 +120,10 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
 def session(studio_session: Session) -> Session:
     """Return the session paused, with every camera placed as in the file and one chosen."""
     studio_session.do(PauseRun())
-    studio_session.happen(MomentShown(None))
+    studio_session.dispatch(MomentShown(None))
     studio_session.do(PutMovedCamerasBack())
     wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
-    studio_session.happen(CameraChosen(BASE))
+    studio_session.dispatch(CameraChosen(BASE))
     return studio_session
 
 
@@ -150,8 +150,8 @@ def test_a_placement_is_written_compared_and_reverted(session: Session, task_fil
     before = saved.replace(b"\n", b"\r\n")  # as a Windows editor saves it
     task_file.write_bytes(before)
     start = camera(session, BASE).now
-    session.happen(CameraPlaced(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2)))
-    session.happen(EditWanted(EditRequest("edit", BASE)))
+    session.dispatch(CameraPlaced(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2)))
+    session.dispatch(EditWanted(EditRequest("edit", BASE)))
     state = reached(session, lambda s: s.edit_state.stage in ("planned", "refused"), "the plan").edit_state
     assert state.stage == "planned", state.message
     assert task_file.read_bytes() == before and "+" in state.edit.diff
@@ -185,8 +185,8 @@ def test_a_change_that_the_hook_overrides_is_refused_before_it_is_written(
     limiting = saved.replace(CALL, CALL.replace("return ", "return limited(") + ")") + LIMITED
     save(session, task_file, limiting)
     for fov, why in ((0.2, "does not give the camera the requested settings"), (0.05, "no lens at all")):
-        session.happen(CameraPlaced(BASE, replace(now, fov=fov)))
-        session.happen(EditWanted(EditRequest("edit", BASE)))
+        session.dispatch(CameraPlaced(BASE, replace(now, fov=fov)))
+        session.dispatch(EditWanted(EditRequest("edit", BASE)))
         state = reached(session, lambda s: s.edit_state.stage == "refused", "the refusal").edit_state
         assert why in state.message and f"fov={fov}" in state.snippet
         assert task_file.read_text() == limiting and camera(session, BASE).info.settings == now
@@ -202,25 +202,25 @@ def settled(session: Session, ready: Callable[[StudioView], object], what: str) 
 
 
 def test_a_camera_is_measured_in_all_envs_and_its_report_is_stale_after_a_move(session: Session) -> None:
-    session.happen(MeasureWanted("envs"))
+    session.dispatch(MeasureWanted("envs"))
     report = settled(session, lambda s: s.results.report_of == BASE, "the judgement").results.report
     assert sorted(report.envs) == [0, 1] and not session.view().of(StudioView).report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.happen(SheetWanted())
+    session.dispatch(SheetWanted())
     sheet = settled(session, lambda s: len(s.results.sheet) == 2, "the pictures of all envs").results.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
     # Point the camera at the sky.
     start = camera(session, BASE).now
     away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
-    session.happen(CameraPlaced(BASE, away))
+    session.dispatch(CameraPlaced(BASE, away))
     assert session.view().of(StudioView).report_stale
-    session.happen(MeasureWanted("envs"))
+    session.dispatch(MeasureWanted("envs"))
     studio = settled(session, lambda s: s.results.report is not report, "the report on the placement")
     assert (
         studio.results.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
     )
-    session.happen(ComparisonWanted(start))
+    session.dispatch(ComparisonWanted(start))
     pair = settled(session, lambda s: s.results.compared is not None, "the comparison").results.compared
     assert pair is not None
     here, there = pair
@@ -231,25 +231,25 @@ def test_a_camera_is_measured_in_all_envs_and_its_report_is_stale_after_a_move(s
 def test_a_camera_is_measured_over_the_steps_of_the_shown_episode(session: Session) -> None:
     start_over(session, 0)
     step(session, 4)
-    session.happen(MeasureWanted("steps"))
+    session.dispatch(MeasureWanted("steps"))
     studio = settled(session, lambda s: len(s.results.report_moments) == 5, "five moments")
     assert [moment.step for moment in studio.results.report_moments] == [0, 1, 2, 3, 4]
     assert {moment.env for moment in studio.results.report_moments} == {0} == set(studio.results.report.envs)
     (cube,) = studio.results.report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.happen(MomentShown(studio.results.report_moments[2].serial))
+    session.dispatch(MomentShown(studio.results.report_moments[2].serial))
     assert session.view().step.elapsed_steps[0] == 2
-    session.happen(MeasureWanted("steps", 2))
+    session.dispatch(MeasureWanted("steps", 2))
     moments = settled(
         session, lambda s: len(s.results.report_moments) == 2, "its ends"
     ).results.report_moments
     assert [moment.step for moment in moments] == [0, 4], (
         "the report covers the whole episode, even while one of its steps is shown"
     )
-    session.happen(EnvsReset())
+    session.dispatch(EnvsReset())
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
-    session.happen(MomentShown(None))
-    session.happen(MeasureWanted("steps"))
+    session.dispatch(MomentShown(None))
+    session.dispatch(MeasureWanted("steps"))
     settled(session, lambda s: len(s.results.report_moments) == 1, "the new episode")
 
 
@@ -261,7 +261,7 @@ def test_a_picked_pixel_returns_the_point_seen_there(session: Session) -> None:
     next_to_cube = replace(
         camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0)
     )
-    session.happen(CameraPlaced(BASE, next_to_cube))
+    session.dispatch(CameraPlaced(BASE, next_to_cube))
     session.do(PickPixel(x=0.5, y=0.5))
     picked = settled(session, lambda s: s.results.picked is not None, "the pixel").results.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
@@ -270,7 +270,7 @@ def test_a_picked_pixel_returns_the_point_seen_there(session: Session) -> None:
 
 @pytest.mark.slow
 def test_measuring_seeds_and_searching_run_in_a_separate_process(session: Session) -> None:
-    session.happen(MeasureWanted("resets", 3))
+    session.dispatch(MeasureWanted("resets", 3))
     assert session.view().of(StudioView).progress is not None
     found = settled(session, lambda s: s.results.report_seeds == 3, "three seeds")
     assert (
@@ -278,17 +278,17 @@ def test_measuring_seeds_and_searching_run_in_a_separate_process(session: Sessio
         and found.results.report_of == BASE
         and not found.results.measuring
     )
-    session.happen(SuggestionsWanted(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2))
+    session.dispatch(SuggestionsWanted(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2))
     offered = settled(session, lambda s: len(s.results.suggestions) > 0, "suggestions").results.suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
     session.do(UsePlacement(number=0))
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
-    session.happen(MeasureWanted("resets", 500))
+    session.dispatch(MeasureWanted("resets", 500))
     reached(session, lambda s: s.results.measuring and s.results.report, "what is known, as from before")
     reached(session, lambda s: s.progress is not None and s.progress.total == 500, "a long judgement")
     session.do(StopMeasuring())
     reached(session, lambda s: s.progress is None and not s.results.measuring, "its end")
-    session.happen(SuggestionsWanted(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1))
+    session.dispatch(SuggestionsWanted(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1))
     reached(session, lambda s: "'nothing' is not an object" in s.problem, "why not")
 
 

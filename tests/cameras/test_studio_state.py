@@ -77,7 +77,7 @@ def runs() -> tuple[Run, ...]:
             fake.reset()
             fake.step(2)
             note(fake)
-        fake.session.happen(MomentShown(1, env=2))
+        fake.session.dispatch(MomentShown(1, env=2))
         note(fake)
         fake.load("rebuilt", cameras=cameras, backend="gpu")
         note(fake)

@@ -140,8 +140,8 @@ def test_a_rule_whose_check_failed_is_shown_with_its_place_and_traceback(checks:
         (ChecksView("loading", waits=True), "waiting for other work"),
         (ChecksView("checking", results=RESULTS, total=58, looks_at="rewards"), "3 of 58 rules"),
         (
-            ChecksView("stopped", results=RESULTS, total=58, why="stopped by hand"),
-            "stopped by hand: 3 of 58 rules",
+            ChecksView("stopped", results=RESULTS, total=58, why="stopped by the user"),
+            "stopped by the user: 3 of 58 rules",
         ),
         (ChecksView("failed", why="the process died"), "the process died"),
     ],
@@ -312,10 +312,10 @@ def test_each_seed_has_a_row_that_opens_its_recording_and_verdicts_are_cards(ser
     assert "1 of 2 seeds" in html and "earned &lt;0.9&gt; a step without success" in html and "21.5" in html
     live.ask(ShowSolved(seed=1))
     assert looked_at == [Path("/r/seed1.rrd")]
-    assert 'data-rule="reward-exploited"' in html and "(seeds 1)" in html and "<b>Mend</b>" not in html
+    assert 'data-rule="reward-exploited"' in html and "(seeds 1)" in html and "<b>Fix</b>" not in html
     live.ask(ToggleVerdict(rule="reward-exploited"))
     live.again()
-    assert "<b>Mend</b>" in live.html()
+    assert "<b>Fix</b>" in live.html()
     third = replace(REPORT.seeds[0], seed=2)
     report = replace(REPORT, wanted=9, seeds=(*REPORT.seeds, third))
     live.show(running(1, seeds=SeedsView("stopped", 5, report, total=9, stale=True)))

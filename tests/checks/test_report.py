@@ -180,7 +180,7 @@ def test_a_task_that_raises_fails_a_check_unless_that_is_silenced(state: State, 
 class Dies:
     """Answers each item, but dies whenever it has the item of this rule."""
 
-    elsewhere = False
+    is_remote = False
 
     def __init__(self, what: CheckOptions, rule: str, problem: Problem | None = None) -> None:
         self.items = plan_of(what, degrees_of_request(what)).items

@@ -35,15 +35,15 @@ def test_html_in_a_text_is_shown_as_text() -> None:
 def test_each_rule_has_its_own_reason_and_remedy() -> None:
     pages = {rule: rule_page(rule) for rule in RULES}
     for rule, page in pages.items():
-        assert page is not None and page.why and page.mend and page.address == f"/help/{rule}", rule
-    assert len({page.mend for page in pages.values() if page is not None}) == len(RULES)
+        assert page is not None and page.why and page.fix and page.address == f"/help/{rule}", rule
+    assert len({page.fix for page in pages.values() if page is not None}) == len(RULES)
     for name in ("no-such-rule", "../rules/same-seed", "Same-seed", ""):
         assert rule_page(name) is None
 
 
 def test_sections_are_divided_at_headings_of_the_second_level() -> None:
-    text = "before\n## Why\none\n\n### not one\n## Mend \n\ntwo\n"
-    assert sections(text) == {"Why": "one\n\n### not one", "Mend": "two"}
+    text = "before\n## Why\none\n\n### not one\n## Fix \n\ntwo\n"
+    assert sections(text) == {"Why": "one\n\n### not one", "Fix": "two"}
 
 
 def test_each_rule_has_the_degree_that_was_asked_for() -> None:

@@ -185,7 +185,7 @@ def test_findings_of_the_previous_version_stay_until_their_rule_is_checked(
     background.hold()
     # Of the first of these versions no rule is checked.
     for text in (NEXT_TEXT, NEXT_TEXT + "\n"):
-        checks.session.happen(FileSaved())
+        checks.session.dispatch(FileSaved())
         load(checks, text)
         assert rules_of(shown(checks).before) == [FIRST, SECOND] and shown(checks).findings == ()
     background.let.release()
@@ -235,7 +235,7 @@ def test_a_save_stops_a_check_and_results_so_far_stay(
     load(checks)
     background.let.release()
     until(lambda: len(shown(checks).results) == 1, "the first rule")
-    checks.session.happen(FileSaved())
+    checks.session.dispatch(FileSaved())
     assert (shown(checks).state, shown(checks).stopped_by) == ("stopped", StoppedBy.SAVE)
     assert rules_of(shown(checks).results) == [FIRST]
     # The same text again, or a save that could not be loaded and was undone.
@@ -297,7 +297,7 @@ def test_a_check_stopped_by_hand_says_so(checks: FakeWorkerSession, background: 
     load(checks)
     checks.session.do(StopChecks())
     view = shown(checks)
-    assert (view.state, view.stopped_by) == ("stopped", StoppedBy.HAND)
+    assert (view.state, view.stopped_by) == ("stopped", StoppedBy.USER)
     checks.session.do(StopChecks())
     assert shown(checks) == view
 
@@ -401,7 +401,7 @@ def test_a_broken_save_is_found_at_its_line_while_playing_and_a_fix_clears_it(
         assert (one.file, one.line, one.degree) == (str(task_file), line, "stop") and bad in one.code
         assert view.playing
         # A person waits for this request: the checks are preempted and then resumed.
-        session.happen(SaveWanted((0,)))
+        session.dispatch(SaveWanted((0,)))
         wait_until(session, lambda view: view.of(RecordingStatus).saving.message != "", "the saved episode")
         task_file.write_text(text)
         wait_until(

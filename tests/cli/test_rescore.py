@@ -129,7 +129,7 @@ def rescoring(
     monkeypatch.setattr("workbench.cli.rescore.rescore_recordings", rescored)
 
 
-def test_the_verdicts_are_in_the_order_of_the_files_with_one_code_a_task(
+def test_verdicts_are_in_file_order_and_each_task_is_loaded_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[RescoreSetup] = []

@@ -148,7 +148,7 @@ def rule_page(rule: DeclaredRule) -> str:
     parts = [
         f"# {rule.id}",
         wrapped(code(rule.asks)),
-        wrapped(f"Otherwise: {code(rule.otherwise)}"),
+        wrapped(f"If broken: {code(rule.otherwise)}"),
         f"*{rule.degree}* · `{rule.hook}`",
         rule.page,
     ]
@@ -167,7 +167,7 @@ def gpu_rules_table() -> str:
     ]
     return "\n".join(
         [
-            "| rule | degree | what the task does | what the GPU does otherwise |",
+            "| rule | degree | what the task does | what the GPU does if it is broken |",
             "| --- | --- | --- | --- |",
             *rows,
         ]

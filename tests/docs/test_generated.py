@@ -48,7 +48,7 @@ def test_each_rule_has_the_page_of_its_declaration_and_there_is_no_other_page(ma
 
 def test_each_rule_explains_why_how_to_fix_it_and_how_it_is_checked() -> None:
     for rule in generate.declared_rules():
-        assert list(sections(rule.page)) == ["Why", "Mend", "How it is checked"], rule.id
+        assert list(sections(rule.page)) == ["Why", "Fix", "How it is checked"], rule.id
         assert rule.asks[-1] == rule.otherwise[-1] == ".", rule.id
 
 

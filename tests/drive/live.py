@@ -68,7 +68,7 @@ class StubSession:
     def do(self, command: Command, page: str = "") -> None:
         self.asked.append(command)
 
-    def happen(self, event: object) -> None:
+    def dispatch(self, event: object) -> None:
         self.asked.append(event)
 
     def __getattr__(self, name: str) -> Any:

@@ -327,7 +327,7 @@ def jump(session: Session, ask: Callable[[], object]) -> SessionView:
 
 def seek(session: Session, serial: int | None) -> None:
     """Show the moment with this serial; live if None."""
-    session.happen(MomentShown(serial))
+    session.dispatch(MomentShown(serial))
 
 
 def seek_by(session: Session, steps: int) -> None:
@@ -350,7 +350,7 @@ def after_worker_reply(session: Session) -> SessionView:
 
 def draw_past(session: Session) -> None:
     """Draw the missing pictures of the shown moment now, as happens when a slider comes to rest."""
-    session.happen(PastPicturesWanted(session.look(lambda run: run.stands_at)))
+    session.dispatch(PastPicturesWanted(session.look(lambda run: run.stands_at)))
 
 
 def stop_watching(session: Session) -> None:
@@ -397,8 +397,8 @@ def moments_of(session: Session) -> list[Moment]:
 
 def work_with(session: Session, background: Any) -> None:
     """Check rules and time steps with `background` instead of a process."""
-    session._checks = CheckJobs(background, session._happen)
-    session._profiles = ProfileJobs(background, session._happen)
+    session._checks = CheckJobs(background, session._dispatch)
+    session._profiles = ProfileJobs(background, session._dispatch)
 
 
 def background_pid(session: Session) -> int | None:

@@ -47,7 +47,7 @@ def test_more_and_fewer_items_stand_side_by_side_and_another_kind_replaces_all(f
     assert drawn.kind == "lines" and [drawn.of_env(env).data.shape[1] for env in range(2)] == [0, 1]
 
 
-def test_after_a_rebuild_only_what_the_version_drew_itself_stays() -> None:
+def test_a_rebuild_removes_the_drawings_of_earlier_versions() -> None:
     kept = TaskDrawings()
     for name in ("old", "both"):
         kept.put(name, texts("a"))

@@ -55,7 +55,7 @@ def into(session: Session, run: RecordedRun, everywhere: bool = False) -> Sessio
 
 
 def step_with(session: Session, action: np.ndarray) -> SessionView:
-    session.happen(SlidersMoved(tuple(range(len(action))), tuple(float(x) for x in action)))
+    session.dispatch(SlidersMoved(tuple(range(len(action))), tuple(float(x) for x in action)))
     return step(session)
 
 
@@ -113,7 +113,7 @@ def test_code_that_raises_while_entering_leaves_the_envs_unchanged(live: Session
     assert view.problem.file == str(file) and "assert" in (view.problem.code or "")
     assert view.timeline.last == last
     file.write_text(text)
-    wait_until(live, lambda v: v.task.source[str(file)] == text, "the text as it was")
+    wait_until(live, lambda v: v.task.source[str(file)] == text, "the restored text")
     moved = step_with(live, np.zeros(8)).step.poses
     assert np.nanmax(np.abs(moved - stood)[..., :3]) < 0.02
 

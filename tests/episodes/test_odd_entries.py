@@ -124,7 +124,7 @@ def test_the_page_plays_and_records_odd_entries(session: Session, file: Path) ->
     def shown(step: StepResult | None) -> bool:
         return step is not None and "best" in step.others and step.others["best"].numbers is not None
 
-    session.happen(RecordingWanted((0, 1)))
+    session.dispatch(RecordingWanted((0, 1)))
     session.do(PlayRun())
     view = wait_until(session, lambda view: shown(view.step), "a later step")
     assert view.problem is None and view.step.others["phase"].texts == ("push",)

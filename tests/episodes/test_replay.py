@@ -115,7 +115,7 @@ def test_actions_of_the_wrong_shape_are_reported_and_the_state_is_set(
 ) -> None:
     run = recorded.run(1)
     step, replay_result = replay_to(task, replace(run, action=run.action[:, :5]), 25, [1])
-    assert replay_result.way == "put there" and "5 dimensions" in replay_result.missed["the way there"]
+    assert replay_result.way == "restored" and "5 dimensions" in replay_result.missed["the way there"]
     assert replay_result.metres is not None and replay_result.metres < 1e-6
     assert step.elapsed_steps[1] == 25
     robot = task.env.env.agent.robot
@@ -194,7 +194,7 @@ def test_actions_that_are_no_numbers_are_not_taken(task: OpenedTask, recorded: R
     action[3] = np.nan
     done: list[int] = []
     _, result = replay_to(task, replace(recorded.run(1), action=action), 10, [0, 2], done.append)
-    assert result.way == "put there" and result.missed.keys() == {"the way there"} and done == []
+    assert result.way == "restored" and result.missed.keys() == {"the way there"} and done == []
     now = read_states(task.env.env)
     for env in (0, 2):
         here = {name: rows[env] for name, rows in now.items()}
@@ -209,7 +209,7 @@ def test_actions_that_are_no_numbers_are_not_taken(task: OpenedTask, recorded: R
 
 def test_each_way_to_a_state_is_told_apart() -> None:
     results = [
-        ReplayResult("put there", 20, 0.0, 0.0),
+        ReplayResult("restored", 20, 0.0, 0.0),
         ReplayResult("corrected", 20, 0.0012, 0.0, corrected=3),
         ReplayResult("re-simulated", 0, 0.0, 0.0),
         ReplayResult("re-simulated", 0, 0.0, 0.0, start_differs=True),

@@ -223,7 +223,7 @@ def assert_continues_as_recorded(session: Session, path: Path, state: int) -> No
     for t in range(state, episode.length):
         last = view.timeline.last
         action = tuple(float(x) for x in episode.action[t])
-        session.happen(SlidersMoved(tuple(range(len(action))), action))
+        session.dispatch(SlidersMoved(tuple(range(len(action))), action))
         session.do(Step())
         view = wait_until(session, lambda v, last=last: v.timeline.last > last, "a step")
         assert_close(view.step.poses[1], episode.poses[t + 1])

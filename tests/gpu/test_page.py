@@ -36,7 +36,7 @@ def test_a_session_plays_with_pictures(
     session: Session, simulation: Simulation, summary_line: SummaryLine
 ) -> None:
     assert ("gpu" in session.view().task.backend) == (simulation == "gpu")
-    session.happen(PagesCounted(1))
+    session.dispatch(PagesCounted(1))
     session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
     session.change(speed=float("inf"))
     session.do(PlayRun())

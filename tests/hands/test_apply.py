@@ -109,7 +109,7 @@ def test_a_paused_body_joint_or_keyframe_moves_in_one_request(
         ((0, 1), (0.25, 0.2), ROOT),
         ((0, 1), (0.5, 0.1), None),
     ]
-    session.happen(BodyMoved("cube", envs, FAR))
+    session.dispatch(BodyMoved("cube", envs, FAR))
     assert fake.asked(MoveBody) == [MoveBody("cube", envs, FAR, last)]
 
 
@@ -120,7 +120,7 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
     def refuse(*wrong: Any) -> None:
         for one in wrong:
             with pytest.raises(Refused):
-                fake.session.do(one) if isinstance(one, Command) else fake.session.happen(one)
+                fake.session.do(one) if isinstance(one, Command) else fake.session.dispatch(one)
         assert hands(fake) == before
         assert not fake.asked(MoveJoints | MoveBody | PullBody | ReachPose | SetSliderAction)  # type: ignore[arg-type]
 
@@ -137,7 +137,7 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
         *(ArmDragged(TIP, 1, pose) for pose in ((0.4, 0.2, 0.1, 0.0, 0.0, 0.0, 0.0), nan)),
         BodyPulled(PullBody("table", 1)),
     )
-    fake.session.happen(MomentShown(0))
+    fake.session.dispatch(MomentShown(0))
     refuse(
         DragJoint(robot="left", joint=0, to=0.0),
         SetJoint(robot="left", joint=0, to=0.0),
@@ -145,7 +145,7 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
         BodyMoved("cube", (0,), FAR),
         BodyPulled(PullBody("cube")),
     )
-    fake.session.happen(MomentShown(None))
+    fake.session.dispatch(MomentShown(None))
     play(fake)
     refuse(UseKeyframe(robot="left", name="rest"), BodyMoved("cube", (0,), FAR))
     refuse(SetJoint(robot="right", joint=0, to=0.0), DragJoint(robot="left", joint=1, to=0.1))
@@ -157,19 +157,19 @@ def test_what_cannot_be_moved_now_is_refused_and_changes_nothing(fake: FakeWorke
     load(fake, "rebuilt", actions=ABSOLUTE)
     fake.reset()
     refuse(ToggleDriving(), WriteQpos("left"))
-    fake.session.happen(Driven(("w",), 0.0))
+    fake.session.dispatch(Driven(("w",), 0.0))
     assert hands(fake) == before, "keys count only for one who drives"
 
 
 def test_links_are_pulled_where_forces_reach_them(fake: FakeWorkerSession) -> None:
     pull = PullBody(TIP, 2, target=(0.0, 0.0, 1.0))
-    fake.session.happen(BodyPulled(pull))
+    fake.session.dispatch(BodyPulled(pull))
     assert fake.asked(PullBody) == [pull]
     load(fake, "rebuilt", backend="gpu")
     fake.reset()
     with pytest.raises(Refused):
-        fake.session.happen(BodyPulled(pull))
-    fake.session.happen(BodyPulled(PullBody("cube", 2)))
+        fake.session.dispatch(BodyPulled(pull))
+    fake.session.dispatch(BodyPulled(PullBody("cube", 2)))
     assert fake.asked(PullBody) == [PullBody("cube", 2)]
 
 
@@ -213,7 +213,7 @@ def test_driving_holds_all_envs_and_gives_back_what_it_took(fake: FakeWorkerSess
         assert fake.asked(SetSliderAction)[0] == SetSliderAction((0, 1, 2, 3), (), ())
         settings = fake.view.settings
         assert (settings.action_source, settings.episode_end) == ("sliders", "continue")
-        fake.session.happen(Driven(("w", "g"), 0.0))
+        fake.session.dispatch(Driven(("w", "g"), 0.0))
         assert hands(fake).keys == ("w", "g") and hands(fake).closes
         fake.session.do(ToggleDriving())
         settings = fake.view.settings
@@ -277,7 +277,7 @@ def test_a_slider_takes_only_the_arms_of_its_envs_out_of_the_handles(fake: FakeW
     fake.session.do(ToggleReach())
     play(fake)
     for env in (1, 2):
-        fake.session.happen(ArmDragged(TIP, env, FAR))
+        fake.session.dispatch(ArmDragged(TIP, env, FAR))
     assert [(one.env, one.how, one.pose) for one in fake.asked(ReachPose)] == [
         (1, "follow", FAR),
         (2, "follow", FAR),
@@ -292,7 +292,7 @@ def test_a_slider_takes_only_the_arms_of_its_envs_out_of_the_handles(fake: FakeW
 def test_a_paused_arm_is_tried_until_the_drag_ends(fake: FakeWorkerSession) -> None:
     fake.session.do(ToggleReach())
     for ends in (False, True):
-        fake.session.happen(ArmDragged(TIP, 1, FAR, ends))
+        fake.session.dispatch(ArmDragged(TIP, 1, FAR, ends))
     asked = fake.asked(ReachPose)
     assert [(one.how, one.origin) for one in asked] == [("try", 1), ("set", 1)] and not hands(fake).driving
     fake.tell(Reached(3, TIP, "try", 0.0, 0.0, ""), Reached(1, TIP, "try", 0.5, 0.0, "far"))

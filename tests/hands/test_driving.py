@@ -128,7 +128,7 @@ def test_a_held_key_moves_the_robot_until_it_is_released_or_the_page_is_silent(s
     assert view.of(Hands).driving and view.settings.episode_end == "continue"
     began = hand(session)[1].copy()
     for _ in itertools.repeat(None, 3):
-        session.happen(Driven(("w",), 0))
+        session.dispatch(Driven(("w",), 0))
         last = session.view().step_serial
         wait_until(session, lambda v, last=last: v.step_serial > last + 2, "steps")
     view = wait_until(session, lambda v: not v.of(Hands).keys, "the keys count as released")
@@ -138,11 +138,11 @@ def test_a_held_key_moves_the_robot_until_it_is_released_or_the_page_is_silent(s
         lambda v: v.slider_action is not None and not v.slider_action[1, :6].any(),
         "the robot holds still",
     )
-    session.happen(Driven(("g",), 0))
+    session.dispatch(Driven(("g",), 0))
     wait_until(
         session, lambda v: v.slider_action is not None and v.slider_action[1, 6] == -1, "the gripper closes"
     )
-    session.happen(Driven((), 0))
+    session.dispatch(Driven((), 0))
     session.do(ToggleDriving())
     view = session.view()
     assert not view.of(Hands).driving

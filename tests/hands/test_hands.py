@@ -34,7 +34,7 @@ def fresh(session: Session) -> int:
     """Pause at the first moment of seed 0's episodes; return the moment's serial."""
     session.do(PauseRun())
     session.change(episode_end="continue", action_source="sliders", selected_env=1)
-    session.happen(SlidersMoved(tuple(range(8)), STILL))
+    session.dispatch(SlidersMoved(tuple(range(8)), STILL))
     return start_over(session, 0).timeline.last
 
 
@@ -45,7 +45,7 @@ def body(session: Session, name: str) -> np.ndarray:
 
 
 def move(session: Session, *env_idx: int) -> None:
-    jump(session, lambda: session.happen(BodyMoved("cube", env_idx, AWAY)))
+    jump(session, lambda: session.dispatch(BodyMoved("cube", env_idx, AWAY)))
 
 
 def test_a_moved_body_is_at_its_pose_in_these_envs_only_and_falls_from_there(session: Session) -> None:
@@ -88,7 +88,7 @@ def test_what_happens_after_a_move_is_repeated_to_the_last_bit(session: Session)
     after = session.view().timeline.last
     kept = session.view().step.poses.copy()
     step(session, 3)
-    session.happen(MomentShown(after))
+    session.dispatch(MomentShown(after))
     jump(session, lambda: session.do(ContinueFromHere()))
     np.testing.assert_array_equal(session.view().step.poses[1], kept[1])
 
@@ -98,7 +98,7 @@ def test_a_spring_lifts_the_body_to_the_pointer_and_lets_go(session: Session) ->
     height = body(session, "cube")[:, 2].copy()
     at = body(session, "cube")[1, :2]
     pull = PullBody("cube", 1, (0.0, 0.0, 0.0), (float(at[0]), float(at[1]), 0.2))
-    session.happen(BodyPulled(pull))
+    session.dispatch(BodyPulled(pull))
     step(session, 25)
     raised = body(session, "cube")[:, 2]
     assert 0.15 < raised[1] < 0.2 and np.allclose(raised[[0, 2]], height[[0, 2]], atol=1e-3)
@@ -110,7 +110,7 @@ def test_a_spring_lifts_the_body_to_the_pointer_and_lets_go(session: Session) ->
     assert len(marks) == 1, "one mark for one pull"
     assert history.replay_path(1, history.last, 400) is None, "its actions alone do not lead there"
     assert history.replay_path(0, history.last, 400) is not None
-    session.happen(BodyPulled(PullBody()))
+    session.dispatch(BodyPulled(PullBody()))
     step(session, 20)
     assert body(session, "cube")[1, 2] < 0.05 and session.view().pulled is None
 
@@ -118,23 +118,23 @@ def test_a_spring_lifts_the_body_to_the_pointer_and_lets_go(session: Session) ->
 def test_a_body_that_is_held_at_a_corner_swings_and_is_not_shaken(session: Session) -> None:
     fresh(session)
     x, y, _ = (float(value) for value in body(session, "cube")[1, :3])
-    session.happen(BodyPulled(PullBody("cube", 1, (0.02, 0.02, 0.02), (x, y, 0.3))))
+    session.dispatch(BodyPulled(PullBody("cube", 1, (0.02, 0.02, 0.02), (x, y, 0.3))))
     step(session, 20)
     newtons = []
     for _ in range(20):
         step(session)
         newtons.append(session.view().pulled.newtons)
-    session.happen(BodyPulled(PullBody()))
+    session.dispatch(BodyPulled(PullBody()))
     assert body(session, "cube")[1, 2] > 0.2 and max(newtons) < 2 * 0.064 * 9.81, "about its weight"
 
 
 def test_a_body_that_a_hand_throws_is_no_mistake_of_the_task(session: Session) -> None:
     fresh(session)
-    session.happen(BodyPulled(PullBody("cube", 1, (0.0, 0.0, 0.0), (0.0, 30.0, 10.0))))
+    session.dispatch(BodyPulled(PullBody("cube", 1, (0.0, 0.0, 0.0), (0.0, 30.0, 10.0))))
     step(session, 3)
     before = body(session, "cube")[1, 1]
     step(session)
-    session.happen(BodyPulled(PullBody()))
+    session.dispatch(BodyPulled(PullBody()))
     step(session)
     assert body(session, "cube")[1, 1] - before > 1.0, "faster than 20 m/s"
     assert not session.view().odd and not session.view().env_table.outliers
@@ -145,8 +145,8 @@ def test_a_link_is_pulled_with_the_weight_of_its_arm(session: Session) -> None:
     hand = "panda/panda_hand"
     before = body(session, hand)[:, :3].copy()
     x, y, z = (float(value) for value in before[1])
-    session.happen(BodyPulled(PullBody(hand, 1, (0.0, 0.0, 0.0), (x, y, z + 0.3))))
+    session.dispatch(BodyPulled(PullBody(hand, 1, (0.0, 0.0, 0.0), (x, y, z + 0.3))))
     step(session, 10)
-    session.happen(BodyPulled(PullBody()))
+    session.dispatch(BodyPulled(PullBody()))
     raised = body(session, hand)[:, 2] - before[:, 2]
     assert raised[1] > 0.1 and abs(raised[0]) < 0.02

@@ -27,11 +27,11 @@ from workbench.envs.robots import Joint
 from workbench.envs.scene.scene_index import read_joints, read_poses, scene_index
 from workbench.hands.commands import ChooseMovedEnvs, DragJoint, SetJoint, UseKeyframe
 from workbench.hands.joints import (
+    display_value,
     keyframe_code,
     limits_text,
     position_of,
     qpos_code,
-    shown,
     slider_bounds,
 )
 from workbench.hands.link_poses import link_poses
@@ -126,7 +126,7 @@ def test_what_happens_after_it_is_repeated_to_the_last_bit(session: Session) -> 
     after = session.view().timeline.last
     kept = session.view().step.poses.copy()
     step(session, 3)
-    session.happen(MomentShown(after))
+    session.dispatch(MomentShown(after))
     jump(session, lambda: session.do(ContinueFromHere()))
     np.testing.assert_array_equal(session.view().step.poses[1], kept[1])
 
@@ -304,7 +304,7 @@ def test_a_slider_shows_degrees_or_metres_and_stays_within_the_limits() -> None:
     assert (
         position_of(hinge, 45.0) == pytest.approx(math.pi / 4) and position_of(hinge, -200.0) == -math.pi / 2
     )
-    assert position_of(rail, 1.0) == 0.04 and shown(rail, 0.0123456) == 0.0123
+    assert position_of(rail, 1.0) == 0.04 and display_value(rail, 0.0123456) == 0.0123
     assert limits_text(hinge) == "-90 to 180°" and limits_text(rail) == "0 to 0.04 m"
     wheel = Joint("wheel", False, -math.inf, math.inf, 0)
     assert slider_bounds(wheel, 0.0) == (-180.0, 180.0) and slider_bounds(wheel, 4 * math.pi) == (

@@ -69,7 +69,7 @@ def kept(session: Session) -> KeptEpisodes:
 
 def drive(session: Session, steps: int) -> None:
     for _ in range(steps):
-        session.happen(Driven(("w",), 0.0))
+        session.dispatch(Driven(("w",), 0.0))
         step(session)
 
 
@@ -99,10 +99,10 @@ def keys_towards(session: Session, pushes: bool) -> tuple[str, ...]:
 def drive_to_success(session: Session) -> int:
     """Close the gripper, and drive until the task succeeds; returns the number of steps."""
     pushes = False
-    session.happen(Driven((GRIPPER_KEY,), 0.0))
+    session.dispatch(Driven((GRIPPER_KEY,), 0.0))
     for count in range(MOST_STEPS):
         pushes = pushes or position(session, TCP)[2] < 0.04
-        session.happen(Driven(keys_towards(session, pushes), 0.0))
+        session.dispatch(Driven(keys_towards(session, pushes), 0.0))
         if step(session).step.evaluate["success"][ENV]:
             return count + 1
     raise AssertionError("the cube did not reach the goal")
@@ -128,7 +128,7 @@ def test_a_driven_episode_is_recorded_and_maniskill_replays_it_to_success(
     session.do(ToggleDriving())
     session.do(PauseRun())
     after_worker_reply(session)
-    jump(session, lambda: session.happen(RecordingWanted((ENV,))))
+    jump(session, lambda: session.dispatch(RecordingWanted((ENV,))))
     drive_to_success(session)
     view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written, "the files")
     with pytest.raises(Refused, match="Shift\\+C"):
@@ -250,7 +250,7 @@ def test_a_kept_episode_that_is_taken_up_again_is_kept_anew(driven: Session) -> 
 def test_what_a_hand_moved_is_told_when_the_episode_is_kept(driven: Session) -> None:
     before = kept(driven)
     drive(driven, 1)
-    jump(driven, lambda: driven.happen(BodyMoved("cube", (ENV,), (0.0, 0.2, 0.02, 1.0, 0.0, 0.0, 0.0))))
+    jump(driven, lambda: driven.dispatch(BodyMoved("cube", (ENV,), (0.0, 0.2, 0.02, 1.0, 0.0, 0.0, 0.0))))
     drive(driven, 1)
     driven.do(KeepEpisode())
     assert "by hand" in driven.view().of(Hands).note

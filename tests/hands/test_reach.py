@@ -49,7 +49,7 @@ def apart(view: SessionView, target: np.ndarray, env: int = 1) -> float:
 
 
 def drag(session: Session, target: np.ndarray, ends: bool = True) -> None:
-    session.happen(ArmDragged(ARM, 1, tuple(map(float, target)), ends))
+    session.dispatch(ArmDragged(ARM, 1, tuple(map(float, target)), ends))
 
 
 def fresh(session: Session) -> np.ndarray:
@@ -166,7 +166,7 @@ def test_each_of_several_robots_has_an_arm(
         names = session.view().task.geometry.body_names
         before = session.view().step.poses[0, [names.index(arm) for arm in arms]].astype(float)
         target = before[1] + WAY
-        view = jump(session, lambda: session.happen(ArmDragged(arms[1], 0, tuple(target.tolist()), True)))
+        view = jump(session, lambda: session.dispatch(ArmDragged(arms[1], 0, tuple(target.tolist()), True)))
         now = view.step.poses[0, [names.index(arm) for arm in arms]]
         assert np.linalg.norm(now[1, :3] - target[:3]) < 0.01
         np.testing.assert_allclose(now[0], before[0], atol=1e-6)

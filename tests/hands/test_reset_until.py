@@ -78,9 +78,9 @@ def test_the_env_in_front_is_preferred_and_the_run_pauses(fake: FakeWorkerSessio
     fake.session.change(selected_env=1)
     fake.session.do(ResetUntil())
     fake.asked(Reset)
-    fake.session.happen(ResetTried(3, 3, ()))
+    fake.session.dispatch(ResetTried(3, 3, ()))
     assert fake.view.of(ResetSearch).tried == 3 and not fake.asked(Reset)
-    fake.session.happen(ResetTried(6, 3, (0, 1)))
+    fake.session.dispatch(ResetTried(6, 3, (0, 1)))
     assert fake.view.of(ResetSearch).state == "found"
     assert (fake.view.seed, fake.view.selected_env) == (6, 1)
     assert fake.worker.sent.count(Reset(None, 6)) == 1 and not fake.asked(Play)[-1].playing
@@ -96,15 +96,15 @@ def test_a_search_is_bounded_stops_and_goes_on_where_it_stopped(
     fake.session.do(ResetUntil())
     (search,) = begun
     assert isinstance(search, BeginSearch) and search.seeds[:2] == range(3, 9, 3)
-    fake.session.happen(ResetTried(3, 3, ()))
+    fake.session.dispatch(ResetTried(3, 3, ()))
     fake.session.do(StopResetUntil())
     assert EndSearch() in begun
-    fake.session.happen(ResetTried(6, 3, (0,)))
+    fake.session.dispatch(ResetTried(6, 3, (0,)))
     assert fake.view.of(ResetSearch).state == "stopped" and fake.view.seed == 0
     fake.session.do(ResetUntil())
     assert begun[-1].seeds[0] == 6
     for seed in begun[-1].seeds:
-        fake.session.happen(ResetTried(seed, 3, ()))
+        fake.session.dispatch(ResetTried(seed, 3, ()))
     assert fake.view.of(ResetSearch).state == "not found"
     fake.session.do(ResetUntil())
     fake.load("patched")
@@ -118,15 +118,15 @@ def test_another_condition_begins_at_the_present_seed_and_a_failure_is_told(
     fake.session.do(ChoosePauseEntry(entry="success"))
     fake.session.do(ResetUntil())
     assert len(begun[-1].seeds) == MAX_RESETS and fake.view.of(ResetSearch).total == 3 * MAX_RESETS
-    fake.session.happen(ResetTried(30, 3, ()))
+    fake.session.dispatch(ResetTried(30, 3, ()))
     fake.session.do(StopResetUntil())
     fake.session.do(ChoosePauseTest(test="becomes false"))
     fake.session.do(ResetUntil())
     assert begun[-1].seeds[0] == 3 and fake.view.of(ResetSearch).tried == 0
-    fake.session.happen(SearchFailed("the task raised", None))
+    fake.session.dispatch(SearchFailed("the task raised", None))
     failed = fake.view.of(ResetSearch)
     assert (failed.state, failed.why) == ("failed", "the task raised")
-    fake.session.happen(ResetTried(33, 3, (0,)))
+    fake.session.dispatch(ResetTried(33, 3, (0,)))
     assert fake.view.of(ResetSearch) == failed
     fake.load("patched")
     assert fake.view.of(ResetSearch) == ResetSearch()

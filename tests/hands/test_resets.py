@@ -104,12 +104,12 @@ def test_a_new_version_is_sampled_again_and_late_results_are_dropped(
     monkeypatch.setattr("workbench.hands.resets.ResetJobs.perform", lambda _, effect: begun.append(effect))
     fake.session.do(SampleResets())
     states = FirstStates(fake.view.step.poses)
-    fake.session.happen(ResetSampled(0, states))
+    fake.session.dispatch(ResetSampled(0, states))
     assert fake.view.of(ResetCloud).seeds == (0,)
     fake.load("patched")
     assert fake.view.of(ResetCloud).seeds == () and len(begun) == 2
     fake.session.do(HideResets())
-    fake.session.happen(ResetSampled(0, states))
+    fake.session.dispatch(ResetSampled(0, states))
     assert fake.view.of(ResetCloud) == replace(ResetCloud(), serial=fake.view.of(ResetCloud).serial)
 
 
@@ -250,10 +250,10 @@ def test_sampling_ends_after_its_batches_or_with_the_reason(
         serials = []
         for seed in seeds:
             assert fake.view.of(ResetCloud).state == "running"
-            fake.session.happen(ResetSampled(seed, FirstStates(fake.view.step.poses)))
+            fake.session.dispatch(ResetSampled(seed, FirstStates(fake.view.step.poses)))
             serials.append(fake.view.of(ResetCloud).serial)
         cloud = fake.view.of(ResetCloud)
         assert cloud.state == "done" and cloud.seeds == seeds and len(set(serials)) == len(seeds)
     fake.session.do(SampleResets())
-    fake.session.happen(SamplingFailed("it raised", None))
+    fake.session.dispatch(SamplingFailed("it raised", None))
     assert (fake.view.of(ResetCloud).state, fake.view.of(ResetCloud).why) == ("failed", "it raised")

@@ -42,10 +42,10 @@ def measured(session: Session) -> SpawnBox:
 def test_a_range_is_measured_dragged_saved_checked_and_reverted(session: Session, file: Path) -> None:
     with pytest.raises(Refused):
         session.do(WriteSpawn())
-    session.happen(SpawnAsked("cube"))
+    session.dispatch(SpawnAsked("cube"))
     box = measured(session)
     (low, high), y = box.measured  # type: ignore[misc]
-    session.happen(SpawnDragged("x_min", low - 0.15))
+    session.dispatch(SpawnDragged("x_min", low - 0.15))
     session.do(SetSpawnSide("x_max", high + 0.1))
     session.do(WriteSpawn())
     edit_reaches(session, "planned", "refused")
@@ -61,7 +61,7 @@ def test_a_range_is_measured_dragged_saved_checked_and_reverted(session: Session
 
 
 def test_a_version_without_the_body_closes_the_range(session: Session, file: Path) -> None:
-    session.happen(SpawnAsked("cube"))
+    session.dispatch(SpawnAsked("cube"))
     measured(session)
     text = TEXT.replace('name="cube"', 'name="block"')
     assert text != TEXT

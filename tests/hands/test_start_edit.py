@@ -55,8 +55,8 @@ def opened(session: Session, file: Path) -> Session:
 
 def want(session: Session) -> StartEdit:
     """Move the cube, ask to write its pose, and wait for the plan."""
-    jump(session, lambda: session.happen(BodyMoved("cube", (0, 1), THERE)))
-    session.happen(StartWanted(BodyPose("cube", THERE)))
+    jump(session, lambda: session.dispatch(BodyMoved("cube", (0, 1), THERE)))
+    session.dispatch(StartWanted(BodyPose("cube", THERE)))
     return edit_reaches(session, "planned", "refused")
 
 

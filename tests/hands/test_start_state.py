@@ -79,8 +79,8 @@ def box_of(fake: FakeWorkerSession) -> SpawnBox:
 
 def planned(fake: FakeWorkerSession) -> int:
     """Plan a change; returns its number."""
-    fake.session.happen(StartWanted(THERE))
-    fake.session.happen(StartPlanned(edit_of(fake).number, EDIT))
+    fake.session.dispatch(StartWanted(THERE))
+    fake.session.dispatch(StartPlanned(edit_of(fake).number, EDIT))
     assert edit_of(fake).stage == "planned"
     return edit_of(fake).number
 
@@ -105,14 +105,14 @@ def test_a_change_is_planned_saved_checked_and_reverted_with_its_own_number(
         session.do(SaveStartChange())
         assert begun.pop() == ChangeStartFile(number, EDIT, revert=False) and edit_of(loaded).writing
         with pytest.raises(Refused):
-            session.happen(StartWanted(THERE))
+            session.dispatch(StartWanted(THERE))
         reload(loaded, NEW)
         check = begun.pop()
         assert isinstance(check, CheckStart) and (check.number, check.wanted) == (number, THERE)
         assert check.seeds == plan.seeds and not edit_of(loaded).writing
-        session.happen(StartChecked(number - 1, "late"))
+        session.dispatch(StartChecked(number - 1, "late"))
         assert edit_of(loaded).stage == "written"
-        session.happen(StartChecked(number, "it is elsewhere" if round else ""))
+        session.dispatch(StartChecked(number, "it is elsewhere" if round else ""))
         assert edit_of(loaded).stage == ("mismatch" if round else "checked")
         session.do(RevertStartChange())
         assert begun.pop() == ChangeStartFile(number, EDIT, revert=True)
@@ -124,29 +124,29 @@ def test_a_change_is_planned_saved_checked_and_reverted_with_its_own_number(
 
 def test_results_of_an_older_request_are_dropped(loaded: FakeWorkerSession) -> None:
     session = loaded.session
-    session.happen(StartWanted(THERE))
+    session.dispatch(StartWanted(THERE))
     old = edit_of(loaded).number
-    session.happen(StartWanted(replace(THERE, of="table")))
+    session.dispatch(StartWanted(replace(THERE, of="table")))
     before = edit_of(loaded)
     for late in (StartPlanned(old, EDIT), StartRefused(old, "no", "")):
-        session.happen(late)
+        session.dispatch(late)
         assert edit_of(loaded) == before
-    session.happen(StartRefused(before.number, "no such call", "pose = here"))
+    session.dispatch(StartRefused(before.number, "no such call", "pose = here"))
     assert edit_of(loaded).stage == "refused" and edit_of(loaded).snippet == "pose = here"
-    session.happen(StartPlanned(before.number, EDIT))
+    session.dispatch(StartPlanned(before.number, EDIT))
     assert edit_of(loaded).stage == "refused", "it was answered already"
 
 
 def test_a_file_that_cannot_be_written_leaves_the_stage_that_the_file_has(loaded: FakeWorkerSession) -> None:
     session, number = loaded.session, planned(loaded)
     session.do(SaveStartChange())
-    session.happen(StartFileFailed(number, "read-only"))
+    session.dispatch(StartFileFailed(number, "read-only"))
     assert edit_of(loaded).stage == "refused" and not edit_of(loaded).writing
     number = planned(loaded)
     session.do(SaveStartChange())
     reload(loaded, NEW)
     session.do(RevertStartChange())
-    session.happen(StartFileFailed(number, "read-only"))
+    session.dispatch(StartFileFailed(number, "read-only"))
     assert edit_of(loaded).stage == "checked" and not edit_of(loaded).writing, (
         "the change is still in the file"
     )
@@ -168,9 +168,9 @@ def test_another_version_ends_the_change_and_the_old_one_does_not(loaded: FakeWo
 def test_a_running_body_is_not_written_but_its_range_is(loaded: FakeWorkerSession, begun: list[Any]) -> None:
     loaded.tell(Status(True, 20.0, 1.0))
     with pytest.raises(Refused):
-        loaded.session.happen(StartWanted(THERE))
+        loaded.session.dispatch(StartWanted(THERE))
     assert not begun
-    loaded.session.happen(StartWanted(SpawnRange("cube", (0.0, 1.0), None)))
+    loaded.session.dispatch(StartWanted(SpawnRange("cube", (0.0, 1.0), None)))
     assert [type(one) for one in begun] == [PlanStart]
 
 
@@ -201,8 +201,8 @@ def test_each_stage_offers_what_can_be_done_and_shows_the_lines_that_hold(
 
 
 def measured(fake: FakeWorkerSession, ranges: Any = RANGES, body: str = "cube") -> SpawnBox:
-    fake.session.happen(SpawnAsked(body))
-    fake.session.happen(SpawnMeasured(box_of(fake).number, SEEN, ranges))
+    fake.session.dispatch(SpawnAsked(body))
+    fake.session.dispatch(SpawnMeasured(box_of(fake).number, SEEN, ranges))
     return box_of(fake)
 
 
@@ -218,8 +218,8 @@ def test_a_range_is_measured_with_the_seeds_of_twelve_episodes(
         RANGES,
         (RANGES[0], SEEN[1]),
     )
-    loaded.session.happen(SpawnMeasured(box.number - 1, SEEN, (None, None)))
-    loaded.session.happen(SpawnFailed(box.number - 1, "late", None))
+    loaded.session.dispatch(SpawnMeasured(box.number - 1, SEEN, (None, None)))
+    loaded.session.dispatch(SpawnFailed(box.number - 1, "late", None))
     assert box_of(loaded) == box
     loaded.session.do(WriteSpawn())
     assert begun[-1].wanted == SpawnRange("cube", *RANGES)
@@ -246,9 +246,9 @@ def test_a_side_moves_alone_and_stays_a_millimetre_from_the_other(loaded: FakeWo
         SpawnAsked("no such body"),
     ):
         with pytest.raises(Refused):
-            loaded.session.happen(wrong)
+            loaded.session.dispatch(wrong)
     assert box_of(loaded) == before
-    loaded.session.happen(SpawnDragged("x_min", 1.0))
+    loaded.session.dispatch(SpawnDragged("x_min", 1.0))
     assert box_of(loaded).wanted == ((RANGES[0][1] - MIN_WIDTH_METRES, RANGES[0][1]), None)
 
 
@@ -263,14 +263,14 @@ def test_a_new_version_is_measured_again_beside_the_old_box(
         loaded.session.do(WriteSpawn())
     with pytest.raises(Refused):
         loaded.session.do(SetSpawnSide(side="x_min", to=0.0))
-    loaded.session.happen(SpawnFailed(again.number, "the task failed", None))
+    loaded.session.dispatch(SpawnFailed(again.number, "the task failed", None))
     assert (box_of(loaded).stage, box_of(loaded).why) == ("failed", "the task failed")
-    loaded.session.happen(SpawnAsked("table"))
+    loaded.session.dispatch(SpawnAsked("table"))
     assert box_of(loaded).measured == (None, None), "the box of another body is not shown for this one"
     begun.clear()
     loaded.session.do(HideSpawn())
     assert begun == [EndSpawn()] and box_of(loaded) == SpawnBox(number=again.number + 2)
     with pytest.raises(Refused):
-        loaded.session.happen(SpawnDragged("x_min", 0.0))
+        loaded.session.dispatch(SpawnDragged("x_min", 0.0))
     reload(loaded, OLD)
     assert begun == [EndSpawn()], "a hidden range is not measured"

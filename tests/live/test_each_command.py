@@ -94,7 +94,7 @@ def ready(fake: FakeWorkerSession) -> FakeWorkerSession:
     fake.play(4)
     fake.session.change(selected_env=SELECTED)
     fake.session.do(SetSeed(seed=7))
-    fake.session.happen(MomentShown(2))
+    fake.session.dispatch(MomentShown(2))
     fake.asked(object)
     return fake
 
@@ -105,7 +105,7 @@ def does(fake: FakeWorkerSession, what: Any) -> list[object]:
     if isinstance(what, Command):
         fake.session.do(what)
     else:
-        fake.session.happen(what)
+        fake.session.dispatch(what)
     return fake.asked(object)
 
 
@@ -239,7 +239,7 @@ def test_an_undo_pauses_first_and_a_continuation_plays_on(ready: FakeWorkerSessi
     (restore,) = ready.asked(Restore)
     assert restore.env_idx == (SELECTED,) and ready.view.playing and ready.view.timeline.shown is None
     ready.back((SELECTED,), (SELECTED,), 2)
-    ready.session.happen(MomentShown(1))
+    ready.session.dispatch(MomentShown(1))
     pictures = ready.view.pictures_serial
     pause, undo = does(ready, UndoReset())
     assert pause == Play(False, 1) and isinstance(undo, Restore) and undo.env_idx == (SELECTED,)
@@ -265,7 +265,7 @@ def test_a_recorded_run_is_entered_in_the_chosen_envs_now_or_after_the_load(
         assert fake.asked(EnterRecording) == [], "once"
         fake.reset()
         fake.session.do(PlayRun())
-        fake.session.happen(MomentShown(0))
+        fake.session.dispatch(MomentShown(0))
         later = fake.session.enter_recording(run, everywhere)
         assert later != number and not fake.view.playing
         assert fake.asked(EnterRecording) == [EnterRecording(run, envs, None, {}, later)]
@@ -321,7 +321,7 @@ def picture(camera: CameraRequest, env: int, grey: int = 0) -> Picture:
 def test_pictures_of_sensors_and_of_people_come_apart_and_only_watched_ones_stay(
     ready: FakeWorkerSession,
 ) -> None:
-    ready.session.happen(MomentShown(None))
+    ready.session.dispatch(MomentShown(None))
     ready.session.change(cameras=(EYE, HAND))
     ready.tell(Pictures((picture(EYE, SELECTED),), 5.0, 4))
     ready.tell(Pictures((picture(HAND, SELECTED),), 7.0, 4))
@@ -358,14 +358,14 @@ def test_a_placed_camera_changes_alone_and_tells_the_page_of_another_size(
 
 
 def test_a_pull_is_shown_only_for_its_step(ready: FakeWorkerSession) -> None:
-    ready.session.happen(MomentShown(None))
+    ready.session.dispatch(MomentShown(None))
     pull = Pulled(1, "cube", 3.0)
     ready.step(pulled=pull)
     assert ready.view.pulled == pull
     at = ready.view.timeline.last
     ready.step()
     assert ready.view.pulled is None
-    ready.session.happen(MomentShown(at))
+    ready.session.dispatch(MomentShown(at))
     assert ready.view.pulled == pull
 
 
@@ -402,11 +402,11 @@ def test_a_saved_policy_resumes_only_a_play_that_it_stopped(played: FakeWorkerSe
 
 
 def test_a_step_of_an_episode_is_shown_in_its_env(ready: FakeWorkerSession) -> None:
-    ready.session.happen(MomentShown(3, 1))
+    ready.session.dispatch(MomentShown(3, 1))
     assert (ready.view.timeline.shown, ready.view.selected_env) == (3, 1)
     (sent, *_) = ready.asked(Settings)
     assert sent.selected_env == 1
-    ready.session.happen(EpisodeStepShown(0, 2))
+    ready.session.dispatch(EpisodeStepShown(0, 2))
     assert (ready.view.timeline.shown, ready.view.selected_env) == (2, 0)
     assert [one.selected_env for one in ready.asked(Settings)] == [0]
 
@@ -416,7 +416,7 @@ def test_a_step_of_an_episode_is_shown_in_its_env(ready: FakeWorkerSession) -> N
 
 def test_what_another_process_gets_of_the_run(ready: FakeWorkerSession) -> None:
     look: Callable[..., Any] = ready.session.look
-    ready.session.happen(OptionsApplied(TaskOptions(8)))
+    ready.session.dispatch(OptionsApplied(TaskOptions(8)))
     again = look(Run.running_load)
     assert (again.options.num_envs, again.options.seed, again.source) == (3, 7, {"push.py": ""})
     assert not again.any_task, "this class ran"
@@ -426,7 +426,7 @@ def test_what_another_process_gets_of_the_run(ready: FakeWorkerSession) -> None:
     assert (shown.env, shown.num_envs) == (SELECTED, 3)
     for env in range(3):
         np.testing.assert_array_equal(shown.of(env), ready.view.step.poses[env])
-    ready.session.happen(MomentShown(None))
+    ready.session.dispatch(MomentShown(None))
     assert look(Run.shown_moment).of(0) is None
     assert [one.serial for one, _ in look(lambda run: run.episode_moments(3))] == [0, 2, 4]
     assert look(Run.newest_env_table).steps.tolist() == [4, 4, 4]
@@ -441,7 +441,7 @@ def test_the_path_of_an_episode_is_that_of_the_selected_env_and_the_shown_moment
 
     def path(env: int, at: int | None) -> list[tuple[int, int]]:
         fake.session.change(selected_env=env)
-        fake.session.happen(MomentShown(at))
+        fake.session.dispatch(MomentShown(at))
         return [(one.serial, row) for one, row in fake.session.look(lambda run: run.episode_moments(99))]
 
     assert path(1, None) == [(3, 1), (4, 1), (5, 1)]
@@ -467,12 +467,12 @@ def test_the_version_of_each_moment_is_known(played: FakeWorkerSession) -> None:
 
 
 def test_a_load_is_listed_with_its_whole_time_and_the_options_that_it_used(played: FakeWorkerSession) -> None:
-    played.session.happen(OptionsApplied(TaskOptions(3, env_kwargs={"size": 2})))
+    played.session.dispatch(OptionsApplied(TaskOptions(3, env_kwargs={"size": 2})))
     played.tell(Loading("building", 2))
     played.load("rebuilt", options=TaskOptions(3, env_kwargs={"size": 2}))
     assert played.view.options.env_kwargs == {"size": 2} and played.view.reload.level == "rebuilt"
     assert played.view.load_milliseconds == played.view.loads[0].milliseconds == 1.0
-    played.session.happen(OptionsApplied(TaskOptions(3, env_kwargs={"size": 2})))
+    played.session.dispatch(OptionsApplied(TaskOptions(3, env_kwargs={"size": 2})))
     (load,) = played.asked(Load)[-1:]
     assert load.options.env_kwargs == {"size": 2}
 
@@ -496,7 +496,7 @@ def test_a_new_process_keeps_the_past_of_the_same_scene_and_rescores_it_with_oth
 
 
 def test_a_worker_that_dies_while_it_draws_takes_the_watched_cameras_along(played: FakeWorkerSession) -> None:
-    played.session.happen(PagesCounted(1))
+    played.session.dispatch(PagesCounted(1))
     played.session.change(cameras=(EYE,))
     played.session.do(PlayRun())
     played.die(replace(DEATH, doing="drawing", end=End.ASKED))

@@ -98,11 +98,11 @@ def test_a_new_scene_starts_a_new_past_and_shows_nothing_of_the_old_one(played: 
     session.change(selected_env=2, cameras=(EYE,))
     played.load("patched", source_hash="b")
     assert played.view.of(RescoreView).state == "loading" and played.view.of(RescoreView).total == 3
-    session.happen(RescoringUpdate(1, RescoreView("rescoring", done=3)))
-    session.happen(RescoringUpdate(1, RescoreView("done", done=3)))
+    session.dispatch(RescoringUpdate(1, RescoreView("rescoring", done=3)))
+    session.dispatch(RescoringUpdate(1, RescoreView("done", done=3)))
     assert (played.view.of(RescoreView).state, played.view.of(RescoreView).done) == ("done", 3)
-    session.happen(MomentShown(1))
-    session.happen(MomentShown(None))
+    session.dispatch(MomentShown(1))
+    session.dispatch(MomentShown(None))
     told = np.ones((3, 2), np.float32)
     played.tell(pictures(2), SliderAction(told), Inspection(2, 3), RulesBroken((FINDING,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
@@ -238,7 +238,7 @@ def test_every_load_is_listed_including_refused_ones(played: FakeWorkerSession) 
 
 def test_a_failed_camera_is_not_requested_until_it_is_ticked_again(played: FakeWorkerSession) -> None:
     other = CameraRequest("hand", "sensor")
-    played.session.happen(PagesCounted(1))
+    played.session.dispatch(PagesCounted(1))
     played.session.change(cameras=(EYE, other))
     played.tell(CameraFailed(EYE.key, "no shader"))
     assert played.view.failed_cameras == {EYE.key: "no shader"}
@@ -262,9 +262,9 @@ def test_pictures_are_of_the_selected_env_and_the_shown_moment(
     played.tell(pictures(0, number=3))
     assert set(played.view.pictures) == {EYE.key}
     serial = played.view.pictures_serial
-    played.session.happen(MomentShown(1))
+    played.session.dispatch(MomentShown(1))
     assert played.view.pictures == {} and played.view.pictures_serial > serial
-    played.session.happen(MomentShown(3))
+    played.session.dispatch(MomentShown(3))
     assert set(played.view.pictures) == {EYE.key}
     played.session.change(selected_env=2)
     assert played.view.pictures == {}
@@ -273,9 +273,9 @@ def test_pictures_are_of_the_selected_env_and_the_shown_moment(
     played.asked(object)
     played.session.change(selected_env=2)
     assert played.asked(Settings) == [], "nothing changed"
-    played.session.happen(PagesCounted(1))
-    played.session.happen(PagesCounted(2))
-    played.session.happen(PagesCounted(0))
+    played.session.dispatch(PagesCounted(1))
+    played.session.dispatch(PagesCounted(2))
+    played.session.dispatch(PagesCounted(0))
     assert [settings.cameras for settings in played.asked(Settings)] == [(EYE,), ()], (
         "no pictures without a page"
     )
@@ -362,8 +362,8 @@ def test_only_files_of_the_task_are_known(tmp_path: Path) -> None:
 
 def test_a_reading_is_requested_and_again_after_its_answer(fake: FakeWorkerSession) -> None:
     fake.play(2)
-    fake.session.happen(PagesCounted(1))
-    fake.session.happen(ReadingChosen(("joints",)))
+    fake.session.dispatch(PagesCounted(1))
+    fake.session.dispatch(ReadingChosen(("joints",)))
     (asked,) = until(lambda: fake.asked(Inspect), "a reading")
     assert (asked.env, asked.sections) == (0, ("joints",))
     fake.step(5)
@@ -379,7 +379,7 @@ FIRST, MORE = TaskOptions(3), TaskOptions(4, env_kwargs={"size": 2})
 
 
 def test_options_take_effect_once_a_load_succeeds_with_them(played: FakeWorkerSession) -> None:
-    played.session.happen(OptionsApplied(MORE))
+    played.session.dispatch(OptionsApplied(MORE))
     (load,) = played.asked(Load)
     assert load.options == MORE and played.view.options == FIRST
     again = played.session.look(Run.running_load)
@@ -396,7 +396,7 @@ def test_options_take_effect_once_a_load_succeeds_with_them(played: FakeWorkerSe
 def test_options_that_make_the_task_fail_are_dropped_and_not_blamed_on_the_file(
     played: FakeWorkerSession, kills: bool
 ) -> None:
-    played.session.happen(OptionsApplied(MORE))
+    played.session.dispatch(OptionsApplied(MORE))
     (load,) = played.asked(Load)
     if kills:
         played.tell(Loading("building", load.number))
@@ -408,11 +408,11 @@ def test_options_that_make_the_task_fail_are_dropped_and_not_blamed_on_the_file(
     assert played.view.problem is not None
     assert (played.view.options, played.view.options_refused) == (FIRST, MORE)
     assert asked_load(played).options == FIRST, "they do not make the next save fail"
-    played.session.happen(OptionsApplied(FIRST))
+    played.session.dispatch(OptionsApplied(FIRST))
     assert played.view.options_refused is None
 
 
 def test_a_task_that_never_ran_keeps_the_options_that_were_chosen_last(fake: FakeWorkerSession) -> None:
-    fake.session.happen(OptionsApplied(MORE))
+    fake.session.dispatch(OptionsApplied(MORE))
     fake.tell(TaskFailed(problem(), kept=False, options=MORE))
     assert fake.view.options == MORE and asked_load(fake).options == MORE

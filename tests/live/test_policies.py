@@ -55,7 +55,7 @@ def test_the_list_follows_the_folder_and_a_used_policy_is_kept(here: Path, fake:
         until(lambda: fake.view.known_policies == wanted, f"{wanted}", seen=lambda: fake.view.known_policies)
 
     (here / "b.py").write_text(ACT)
-    fake.session.happen(PagesCounted(1))
+    fake.session.dispatch(PagesCounted(1))
     fake.session.do(ChooseActions(source="policy"))
     listed("b.py:act")
     (here / "a.py").write_text(ACT)

@@ -166,7 +166,7 @@ def test_recording_and_playing_go_on_after_a_refused_version(
     file.write_text(good)
     with live_session(file, tmp_path / "recordings") as session:
         session.change(speed=8.0)
-        session.happen(RecordingWanted((0,)))
+        session.dispatch(RecordingWanted((0,)))
         session.do(PlayRun())
         wait_until(session, lambda v: v.of(RecordingStatus).steps > 3, "some recorded steps")
         file.write_text(in_evaluate(good, "raise ValueError('enough')"))
@@ -176,7 +176,7 @@ def test_recording_and_playing_go_on_after_a_refused_version(
         wait_until(
             session, lambda v: v.of(RecordingStatus).episodes_written >= 1, "the episode that was running"
         )
-        session.happen(EnvsReset((0,)))
+        session.dispatch(EnvsReset((0,)))
         wait_until(session, lambda v: v.of(RecordingStatus).steps > 3, "steps of the next episode")
         session.do(StopRecording())
         wait_until(session, lambda v: v.of(RecordingStatus).episodes_written >= 2, "both episodes")

@@ -164,7 +164,7 @@ def test_one_of_two_tasks_in_a_file_can_be_chosen_and_stays_chosen(
 def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
     session: Session, task_file: Path, good: str
 ) -> None:
-    session.happen(RecordingWanted((0,)))
+    session.dispatch(RecordingWanted((0,)))
     before = played(session, 5)
     assert before.of(RecordingStatus).steps > 0
     view = save(session, task_file, reward_plus(good, 41))
@@ -173,7 +173,7 @@ def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
         session, lambda v: v.of(RecordingStatus).episodes_written == 1, "the episode of the old version"
     )
     assert view.of(RecordingStatus).active and view.of(RecordingStatus).steps == 0
-    session.happen(EnvsReset((0,)))
+    session.dispatch(EnvsReset((0,)))
     played(session, 3)
     assert session.view().of(RecordingStatus).steps >= 3
     session.do(StopRecording())

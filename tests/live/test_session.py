@@ -49,7 +49,7 @@ def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     settle(session)
     step(session, 3)
     before = session.view().step
-    session.happen(EnvsReset((1,)))
+    session.dispatch(EnvsReset((1,)))
     after = wait_until(session, lambda v: v.step.elapsed_steps[1] == 0, "the reset of env 1").step
     assert after.elapsed_steps.tolist() == [3, 0]
     assert np.array_equal(after.poses[0], before.poses[0], equal_nan=True)
@@ -66,7 +66,7 @@ def test_a_slider_moves_one_joint_of_one_env_from_its_current_targets(
             "not the middle of the limits"
         )
         assert np.allclose(step(session, 3).step.action, start), "untouched, each joint keeps its target"
-        session.happen(SlidersMoved((0,), (5.0,), (1,)))
+        session.dispatch(SlidersMoved((0,), (5.0,), (1,)))
         moved = wait_until(
             session, lambda v: v.slider_action[1, 0] != start[1, 0], "the slider"
         ).slider_action
@@ -81,7 +81,7 @@ def test_a_slider_moves_one_joint_of_one_env_from_its_current_targets(
         assert np.allclose(
             slider_values(session, lambda v: not np.array_equal(v.slider_action, moved)), acted
         )
-        session.happen(EnvsReset((0,)))
+        session.dispatch(EnvsReset((0,)))
         after = slider_values(
             session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.slider_action, acted)
         )
@@ -230,7 +230,7 @@ def test_pictures_are_of_the_selected_env_and_only_while_they_are_shown(session:
     session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
     assert not session.view().pictures, "no picture is shown yet"
-    session.happen(PagesCounted(1))
+    session.dispatch(PagesCounted(1))
     session.change(selected_env=1)
     view = wait_until(session, lambda v: bool(v.pictures), "a picture")
     picture = view.pictures["sensor", sensor.name]
@@ -238,7 +238,7 @@ def test_pictures_are_of_the_selected_env_and_only_while_they_are_shown(session:
     assert picture.rgb.shape == (sensor.height, sensor.width, 3) and picture.rgb.std() > 5
     assert picture.depth.shape == (sensor.height, sensor.width) and picture.depth.max() > 0.1
     assert set(np.unique(picture.segmentation)) - {0} <= view.task.segmentation.keys()
-    session.happen(PagesCounted(0))
+    session.dispatch(PagesCounted(0))
     session.change(selected_env=0)
     session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")

@@ -90,7 +90,7 @@ def test_a_recording_that_cannot_be_written_blocks_no_step(
 ) -> None:
     with fake_worker_session(tmp_path / "kept") as fake:
         fake.play(0)
-        fake.session.happen(RecordingWanted((0,)))
+        fake.session.dispatch(RecordingWanted((0,)))
         hangs = threading.Event()
         write = os.pwrite
 

@@ -33,7 +33,7 @@ def fresh(session: Session) -> int:
     session.do(PauseRun())
     session.change(episode_end="reset")
     session.change(action_source="sliders")
-    session.happen(SlidersMoved(tuple(range(8)), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
+    session.dispatch(SlidersMoved(tuple(range(8)), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
     return start_over(session, 0).timeline.last
 
 
@@ -53,7 +53,7 @@ def test_a_branch_repeats_the_past_to_the_last_bit(session: Session) -> None:
     step(session, 8)
     branches = []
     for _ in range(2):
-        session.happen(MomentShown(start + 3))
+        session.dispatch(MomentShown(start + 3))
         view = jump(session, lambda: session.do(ContinueFromHere(scope="all")))
         assert view.step.elapsed_steps.tolist() == [3] * N
         assert is_close(view.step.poses, poses(session, start + 3))
@@ -70,7 +70,7 @@ def test_the_abandoned_future_can_be_returned_to(session: Session) -> None:
     start = fresh(session)
     step(session, 6)
     left = session.view().step
-    session.happen(MomentShown(start + 2))
+    session.dispatch(MomentShown(start + 2))
     jump(session, lambda: session.do(ContinueFromHere(scope="all")))
     step(session, 2)
     assert session.view().timeline.undo == "jump of all"
@@ -83,10 +83,10 @@ def test_resets_can_be_undone_one_after_another(session: Session) -> None:
     fresh(session)
     step(session, 3)
     first = session.view().step
-    jump(session, lambda: session.happen(EnvsReset((0, 1))))
+    jump(session, lambda: session.dispatch(EnvsReset((0, 1))))
     step(session, 2)
     second = session.view().step
-    jump(session, lambda: session.happen(EnvsReset(None)))
+    jump(session, lambda: session.dispatch(EnvsReset(None)))
     view = jump(session, lambda: session.do(UndoReset()))
     assert is_close(view.step.poses, second.poses)
     view = jump(session, lambda: session.do(UndoReset()))
@@ -99,16 +99,16 @@ def test_a_moment_without_an_action_has_its_recorded_reward_or_none(session: Ses
     begin = session.view().timeline.last_tick
     assert np.isnan(session.view().step.reward).all()
     rewards = [step(session, 1).step.reward for _ in range(4)]
-    view = jump(session, lambda: session.happen(EnvsReset((1,))))
+    view = jump(session, lambda: session.dispatch(EnvsReset((1,))))
     assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
-    session.happen(MomentShown(start + 2))
+    session.dispatch(MomentShown(start + 2))
     view = jump(session, lambda: session.do(ContinueFromHere(scope="all")))
     assert np.array_equal(view.step.reward, rewards[1])
     assert not view.timeline.not_carried
     strip = session.look(lambda run: run.strip(begin, view.timeline.last_tick))
     # A strip contains control steps, not the reset and the jump back after them.
     assert np.array_equal(strip.values[1:], [reward[0] for reward in rewards])
-    session.happen(MomentShown(start + 2))
+    session.dispatch(MomentShown(start + 2))
     assert not jump(session, lambda: session.do(ContinueFromHere(scope="into all"))).timeline.not_carried
 
 
@@ -118,10 +118,10 @@ def test_going_back_ends_a_recording(session: Session) -> None:
     written = session.view().of(RecordingStatus).episodes_written
     step(session, 1)
     last = session.view().timeline.last
-    session.happen(RecordingWanted((0,)))
+    session.dispatch(RecordingWanted((0,)))
     wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
     step(session, 3)
-    session.happen(MomentShown(start + 1))
+    session.dispatch(MomentShown(start + 1))
     jump(session, lambda: session.do(ContinueFromHere(scope="this")))
     view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written == written + 1, "the file")
     assert view.of(RecordingStatus).active and view.of(RecordingStatus).problem is None
@@ -140,10 +140,10 @@ def test_a_moment_without_a_picture_is_drawn_in_its_past_state(session: Session)
     wanted = CameraRequest(human.name, "human", ("rgb",))
     # Otherwise the first picture after a jump is a fast one.
     session.change(cameras=(wanted,), pictures="exact")
-    session.happen(PagesCounted(1))
+    session.dispatch(PagesCounted(1))
     key = ("human", human.name)
     now = wait_until(session, lambda v: key in v.pictures, "the live picture").pictures[key]
-    session.happen(MomentShown(start))
+    session.dispatch(MomentShown(start))
     assert session.view().pictures == {} and session.view().timeline.wants_pictures
     draw_past(session)
     then = wait_until(session, lambda v: key in v.pictures, "the picture of the past").pictures[key]
@@ -159,7 +159,7 @@ def test_a_moment_without_a_picture_is_drawn_in_its_past_state(session: Session)
     again = wait_until(session, lambda v: v.pictures_serial > serial and key in v.pictures, "its picture")
     assert np.abs(then.rgb.astype(int) - again.pictures[key].rgb).max() <= 2
     session.change(cameras=(), pictures="auto")
-    session.happen(PagesCounted(0))
+    session.dispatch(PagesCounted(0))
 
 
 @pytest.mark.slow

@@ -46,23 +46,23 @@ def at(fake: FakeWorkerSession) -> int:
 
 
 def test_pictures_of_a_past_moment_are_requested_once_per_env(played: FakeWorkerSession) -> None:
-    played.session.happen(MomentShown(2))
+    played.session.dispatch(MomentShown(2))
     for env in (0, 1, 2, 0):
         (asked,) = drawn(played, env, EYE)
         assert (asked.env, asked.origin) == (env, 2)
         np.testing.assert_array_equal(asked.poses, played.view.step.poses[env])
         assert drawn(played, env, EYE) == []
     assert [one.cameras for one in drawn(played, 0, EYE, HAND)] == [(EYE, HAND)]
-    played.session.happen(MomentShown(1))
+    played.session.dispatch(MomentShown(1))
     assert [one.origin for one in drawn(played, 0, EYE, HAND)] == [1]
-    played.session.happen(MomentShown(None))
+    played.session.dispatch(MomentShown(None))
     assert drawn(played, 0, EYE) == []
 
 
 def test_a_moment_gets_pictures_when_the_slider_rests_and_none_during_a_drag(
     played: FakeWorkerSession,
 ) -> None:
-    played.session.happen(PagesCounted(1))
+    played.session.dispatch(PagesCounted(1))
     played.session.change(cameras=(EYE,))
     played.asked(object)
     seek(played.session, 1)
@@ -78,7 +78,7 @@ def test_a_moment_gets_pictures_when_the_slider_rests_and_none_during_a_drag(
 
 
 def test_only_missing_or_outdated_pictures_are_requested(played: FakeWorkerSession) -> None:
-    played.session.happen(MomentShown(1))
+    played.session.dispatch(MomentShown(1))
     played.tell(PastPictures(1, (picture(1), picture(0, "hand"))))
     assert drawn(played, 1, EYE) == [] and not played.view.timeline.wants_pictures
     assert list(played.view.pictures) == [EYE.key]
@@ -99,7 +99,7 @@ def test_only_missing_or_outdated_pictures_are_requested(played: FakeWorkerSessi
 
 def test_a_fast_picture_is_redrawn_exactly_unless_fast_pictures_are_chosen(played: FakeWorkerSession) -> None:
     played.tell(Pictures((picture(1, degree="fast"),), 5.0, 1))
-    played.session.happen(MomentShown(1))
+    played.session.dispatch(MomentShown(1))
     assert drawn(played, 1, EYE, degree="fast") == [] and not played.view.timeline.wants_pictures
     assert [one.cameras for one in drawn(played, 1, EYE)] == [(EYE,)] and played.view.timeline.wants_pictures
     assert list(played.view.pictures) == [EYE.key], "the fast picture is shown meanwhile"
@@ -133,7 +133,7 @@ def test_a_moment_is_pinned_until_the_view_returns_to_live(played: FakeWorkerSes
 def test_when_a_pinned_moment_is_dropped_the_oldest_is_shown(tmp_path: Path) -> None:
     with fake_worker_session(tmp_path, history_bytes=60_000) as fake:
         fake.play(2)
-        fake.session.happen(MomentShown(1))
+        fake.session.dispatch(MomentShown(1))
         fake.step(97)
         timeline = fake.view.timeline
         assert timeline.first > 1 and timeline.shown == timeline.first == at(fake)
@@ -161,9 +161,9 @@ def test_keys_move_through_events_steps_and_moments_of_an_env(fake: FakeWorkerSe
     session.do(NextEvent())
     assert fake.view.timeline.shown is None
     # Within the shown episode, across resets of other envs.
-    session.happen(EpisodeStepShown(1, 0))
+    session.dispatch(EpisodeStepShown(1, 0))
     assert at(fake) == 4
-    session.happen(EpisodeStepShown(0, 3))
+    session.dispatch(EpisodeStepShown(0, 3))
     assert at(fake) == 3
     # A step back skips resets of other envs.
     ways = {}
@@ -204,7 +204,7 @@ def test_in_the_past_the_table_of_envs_shows_the_past(played: FakeWorkerSession)
     played.reset((1,))
     played.step()
     assert played.session.env_rows().steps.tolist() == [4, 1, 4]
-    played.session.happen(MomentShown(2))
+    played.session.dispatch(MomentShown(2))
     then = played.session.env_rows()
     assert then.steps.tolist() == [2, 2, 2] and then.total.tolist() == [3, 3, 3]
     assert [np.isfinite(row).sum() for row in then.rewards] == [2, 2, 2]
@@ -219,17 +219,17 @@ def test_an_event_of_an_env_is_found_in_earlier_episodes_too(played: FakeWorkerS
     lost = played.view.timeline.last
     played.reset((1,))
     played.step(2)
-    session.happen(MomentShown(1))
-    session.happen(EnvEventShown(1, "failed"))
+    session.dispatch(MomentShown(1))
+    session.dispatch(EnvEventShown(1, "failed"))
     assert (at(played), session.view().selected_env) == (failed, 1)
-    session.happen(EnvEventShown(1, "flagged"))
+    session.dispatch(EnvEventShown(1, "flagged"))
     assert at(played) == lost
-    session.happen(EnvEventShown(2, "failed"))
+    session.dispatch(EnvEventShown(2, "failed"))
     assert (at(played), session.view().selected_env) == (lost, 2), "env 2 has not failed"
     played.step(fail=(1,))
     played.reset((1,))
     played.step(2)
-    session.happen(EnvEventShown(1, "failed"))
+    session.dispatch(EnvEventShown(1, "failed"))
     assert at(played) == played.view.timeline.last - 3, "the newest of two"
     assert session.view().env_table is not None and session.view().env_table.failed.tolist() == [0, 2, 0]
 
@@ -242,9 +242,9 @@ def test_an_end_at_the_time_limit_is_no_fail(fake: FakeWorkerSession) -> None:
     fake.reset((1,))
     fake.step(truncated=(1,))
     limit = fake.view.timeline.last
-    session.happen(EnvEventShown(1, "failed"))
+    session.dispatch(EnvEventShown(1, "failed"))
     assert at(fake) == failed
-    session.happen(EnvEventShown(1, "limit"))
+    session.dispatch(EnvEventShown(1, "limit"))
     assert at(fake) == limit
 
 
@@ -269,7 +269,7 @@ def test_an_episode_that_a_task_ends_by_a_rule_of_its_own_failed(fake: FakeWorke
     fake.play(1)
     fake.step(evaluate={}, fail=(2,))
     fake.reset((2,))
-    fake.session.happen(EnvEventShown(2, "failed"))
+    fake.session.dispatch(EnvEventShown(2, "failed"))
     assert at(fake) == fake.view.timeline.last - 1
     strip = fake.session.look(lambda run: run.strip(0, 9))
     assert strip is not None and [ending for *_, ending in strip.segments] == ["fail", ""]
@@ -335,7 +335,7 @@ def test_a_replay_to_a_moment_starts_at_the_last_exact_state(played: FakeWorkerS
     def replay(env: int, serial: int) -> tuple[int, int, int] | None:
         played.asked(object)
         played.session.change(selected_env=env)
-        played.session.happen(MomentShown(serial))
+        played.session.dispatch(MomentShown(serial))
         played.session.do(ContinueFromHere(scope="this"))
         (asked,) = played.asked(Restore)
         found = asked.ways.get(env)
@@ -367,7 +367,7 @@ def test_a_jump_is_undone_in_the_envs_that_are_still_in_it(played: FakeWorkerSes
 
     def undone(env: int) -> tuple[tuple[int, ...], int, int | None]:
         session.change(selected_env=env)
-        session.happen(MomentShown(1))
+        session.dispatch(MomentShown(1))
         played.asked(object)
         session.do(UndoReset())
         (asked,) = played.asked(Restore)
@@ -400,13 +400,13 @@ def test_state_that_a_jump_could_not_restore_is_reported_only_for_its_env_and_ep
         view = played.view.timeline
         return view.not_carried, view.arrived
 
-    played.back((1,), (1,), 2, not_carried={"actor ball": "the snapshot has none"}, how="put there")
+    played.back((1,), (1,), 2, not_carried={"actor ball": "the snapshot has none"}, how="restored")
     played.step()
-    missing = ("actor ball: the snapshot has none",), "put there"
+    missing = ("actor ball: the snapshot has none",), "restored"
     assert report_of(1) == missing and report_of(0) == ((), "")
-    played.session.happen(MomentShown(1))
+    played.session.dispatch(MomentShown(1))
     assert report_of(1) == ((), ""), "before the jump"
-    played.session.happen(MomentShown(None))
+    played.session.dispatch(MomentShown(None))
     played.reset((0,))
     assert report_of(1) == missing, "another env was reset"
     played.reset((1,))

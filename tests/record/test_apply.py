@@ -315,7 +315,7 @@ def test_a_rescoring_stopped_by_a_save_restarts_if_the_version_stays_the_same() 
     state, effects = after(*begun, loaded("rebuilt", "c"))
     assert state.rescoring.view.state == "none" and effects[0] == EndRescoring()
     state, _ = after(*begun, Asked(StopRescoring()))
-    assert state.rescoring.view.stopped_by is StoppedBy.HAND
+    assert state.rescoring.view.stopped_by is StoppedBy.USER
     with pytest.raises(Refused):
         apply_filtered(state, Asked(StopRescoring()))
 

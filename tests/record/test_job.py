@@ -189,7 +189,7 @@ class RandomOrderExecutor:
 
     def __init__(self, good: list[bool], slots: int, data: st.DataObject) -> None:
         self.good, self.slots, self.data = good, slots, data
-        self.elsewhere = False
+        self.is_remote = False
 
     def run(self, work: Work, scheduler: Scheduler) -> None:
         (what,) = work.setup.wanted

@@ -81,7 +81,7 @@ def assert_same(one: Episode, other: Episode) -> None:
 
 @pytest.mark.slow
 def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) -> None:
-    session.happen(RecordingWanted())
+    session.dispatch(RecordingWanted())
     wait_until(
         session,
         lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
@@ -92,7 +92,7 @@ def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) 
     assert view.of(RecordingStatus).bytes_written > 0
     session.do(StopRecording())
     live = written(session, 2)
-    session.happen(SaveWanted())
+    session.dispatch(SaveWanted())
     wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the keeping")
     expected = f"Saved 2 episodes, {2 * STEPS} steps; none of them had ended"
     assert session.view().of(RecordingStatus).saving.message == expected
@@ -117,18 +117,18 @@ def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) 
 def test_the_previous_episode_can_be_saved(session: Session) -> None:
     count = session.view().of(RecordingStatus).episodes_written
     for steps in (3, 1):
-        session.happen(EnvsReset())
+        session.dispatch(EnvsReset())
         for made in range(steps):
             session.change(action_source="random" if made == 0 else "hold")
             session.do(Step())
         wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
-    session.happen(SaveWanted((0,), before=True))
+    session.dispatch(SaveWanted((0,), before=True))
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
     # Without a recording both envs were reset together: env 0 starts as it would alone, env 1 does not.
     message = session.view().of(RecordingStatus).saving.message
     assert kept.info.seed == 5 and "seed" not in message
-    session.happen(SaveWanted((1,), before=True))
+    session.dispatch(SaveWanted((1,), before=True))
     kept = written(session, count + 2)[-1]
     assert kept.info.env_index == 1 and kept.info.seed == -1
     message = (
@@ -146,7 +146,7 @@ def test_the_previous_episode_can_be_saved(session: Session) -> None:
 @pytest.mark.slow
 def test_an_episode_of_an_earlier_version_is_saved_with_its_own_source(session: Session) -> None:
     count = session.view().of(RecordingStatus).episodes_written
-    session.happen(EnvsReset())
+    session.dispatch(EnvsReset())
     wait_until(session, lambda view: elapsed(view) == 0, "a reset")
     step(session, 2)
     played = wait_until(session, lambda view: elapsed(view) == 2, "the steps")
@@ -160,7 +160,7 @@ def test_an_episode_of_an_earlier_version_is_saved_with_its_own_source(session: 
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash != version.source_hash, "it"
     )
-    session.happen(SaveWanted((0,)))
+    session.dispatch(SaveWanted((0,)))
     kept = written(session, count + 1)[-1]
     assert kept.info.source_hash == version.source_hash
     assert list(kept.info.source.values()) == list(version.source.values())
@@ -181,7 +181,7 @@ def test_an_episode_of_an_earlier_version_is_saved_with_its_own_source(session: 
 def test_a_rebuild_while_recording_keeps_every_env_in_place_and_waits_for_a_reset(
     session: Session,
 ) -> None:
-    session.happen(RecordingWanted((0,)))
+    session.dispatch(RecordingWanted((0,)))
     wait_until(
         session,
         lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
@@ -208,16 +208,16 @@ def test_a_rebuild_while_recording_keeps_every_env_in_place_and_waits_for_a_rese
 @pytest.mark.slow
 def test_recording_the_next_episode_waits_for_a_reset_and_ends_with_the_next(session: Session) -> None:
     before = session.view().of(RecordingStatus).episodes_written
-    session.happen(RecordingWanted((1,), next_episode=True))
+    session.dispatch(RecordingWanted((1,), next_episode=True))
     step(session, 1)
     view = wait_until(session, lambda view: view.of(RecordingStatus).waiting == 1, "the waiting")
     assert view.of(RecordingStatus).active and view.of(RecordingStatus).steps == 0
-    session.happen(EnvsReset((1,)))
+    session.dispatch(EnvsReset((1,)))
     wait_until(session, lambda view: view.of(RecordingStatus).waiting == 0, "the reset")
     step(session, 1)
     session.change(action_source="zero")
     step(session, 1)
-    session.happen(EnvsReset((1,)))
+    session.dispatch(EnvsReset((1,)))
     wait_until(session, lambda view: not view.of(RecordingStatus).active, "its end")
     session.change(action_source="random")
     step(session, 1)
@@ -232,14 +232,14 @@ def test_an_unwritable_folder_is_reported_and_the_session_continues(session: Ses
     folder.mkdir(exist_ok=True)  # it may not exist yet
     aside = folder.rename(folder.with_name("aside"))
     folder.write_text("in the way")
-    session.happen(RecordingWanted((0,)))
+    session.dispatch(RecordingWanted((0,)))
     view = wait_until(session, lambda view: view.of(RecordingStatus).problem is not None, "the problem")
     assert not view.of(RecordingStatus).active and "is not a folder" in str(view.of(RecordingStatus).problem)
     step(session, 2)
     assert session.view().problem is None
     folder.unlink()
     aside.rename(folder)
-    session.happen(RecordingWanted((0,)))
+    session.dispatch(RecordingWanted((0,)))
     wait_until(
         session,
         lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
@@ -258,16 +258,16 @@ def test_a_recording_holds_both_the_moved_and_the_files_camera_placement(
     assert in_file is not None
     there = replace(in_file, position=(0.31, 0.02, 0.55))
     count = session.view().of(RecordingStatus).episodes_written
-    session.happen(CameraPlaced(BASE, there))
+    session.dispatch(CameraPlaced(BASE, there))
     wait_until(session, lambda view: moved(view) == {BASE}, "the placement")
-    session.happen(RecordingWanted((0,)))
+    session.dispatch(RecordingWanted((0,)))
     wait_until(
         session,
         lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
         "the recording",
     )
     step(session, 2)
-    session.happen(SaveWanted((0,)))
+    session.dispatch(SaveWanted((0,)))
     past = written(session, count + 1)[-1]
     session.do(PutMovedCamerasBack())
     wait_until(session, lambda view: not moved(view), "the file's placement")

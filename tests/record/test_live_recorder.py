@@ -39,14 +39,14 @@ def test_a_recovered_episode_is_named_on_the_page_and_in_the_terminal(
 def test_an_episode_cut_off_by_a_stop_or_a_death_is_written(child_process: None, tmp_path: Path) -> None:
     with fake_worker_session(tmp_path) as fake:
         with pytest.raises(Refused):
-            fake.session.happen(RecordingWanted())
+            fake.session.dispatch(RecordingWanted())
         assert fake.asked(SetCapture) == [], "no task is loaded yet"
         fake.play(0)
         with pytest.raises(Refused):
             fake.session.do(StopRecording())
         for count, end in enumerate((lambda: fake.session.do(StopRecording()), fake.die), 1):
             fake.asked(object)
-            fake.session.happen(RecordingWanted((0, 2)))
+            fake.session.dispatch(RecordingWanted((0, 2)))
             assert [type(one) for one in fake.asked((SetCapture, Reset))] == [SetCapture, Reset]  # type: ignore[arg-type]
             fake.reset((2,))
             fake.step()
@@ -70,7 +70,7 @@ def test_an_invalid_step_ends_the_recording_with_a_message_and_keeps_the_thread(
     listen(notices.append)
     try:
         for _ in range(2):
-            played.session.happen(RecordingWanted((0,)))
+            played.session.dispatch(RecordingWanted((0,)))
             assert played.view.of(RecordingStatus).problem is None, (
                 "the problem of the previous recording is cleared"
             )
@@ -95,20 +95,20 @@ def test_the_previous_episode_is_the_last_one_with_a_step_however_often_the_env_
         for _ in range(3):
             fake.reset()
         fake.step(2)
-        fake.session.happen(SaveWanted((0,), before=True))
+        fake.session.dispatch(SaveWanted((0,), before=True))
         assert not fake.view.of(RecordingStatus).saving.failed
 
 
 def test_a_refusal_to_save_the_past_is_shown_only_where_it_applies(tmp_path: Path) -> None:
     with fake_worker_session(tmp_path, history_bytes=20_000) as fake:
-        fake.session.happen(SaveWanted((0,)))
+        fake.session.dispatch(SaveWanted((0,)))
         assert fake.view.of(RecordingStatus).saving.failed, "no task"
         fake.play(0)
-        fake.session.happen(SaveWanted((0,)))
+        fake.session.dispatch(SaveWanted((0,)))
         assert fake.view.of(RecordingStatus).saving.failed, "no step"
         fake.step(100)
         assert fake.view.timeline.first > 0 and not fake.view.of(RecordingStatus).saving.message
-        fake.session.happen(SaveWanted((0,)))
+        fake.session.dispatch(SaveWanted((0,)))
         refused = fake.view.of(RecordingStatus).saving
         assert refused.failed and "no longer in memory" in refused.message and refused.progress is None
         fake.session.change(selected_env=1)
@@ -120,11 +120,11 @@ def test_a_refusal_to_save_the_past_is_shown_only_where_it_applies(tmp_path: Pat
         fake.reset()
         fake.step(2)
         fake.reset()
-        fake.session.happen(SaveWanted((0,), before=True))
+        fake.session.dispatch(SaveWanted((0,), before=True))
         assert fake.view.of(RecordingStatus).saving.failed, (
             "the previous episode began before the kept history"
         )
-        fake.session.happen(RecordingWanted())
+        fake.session.dispatch(RecordingWanted())
         assert not fake.view.of(RecordingStatus).saving.message, "a new recording replaces the message"
         assert moment_at(fake.session, 0) is None
 
@@ -146,7 +146,7 @@ def test_bytes_on_the_disk_no_longer_count_as_waiting(
         try:
             for _ in range(2):
                 taker.disk.set()
-                fake.session.happen(RecordingWanted((0,)))
+                fake.session.dispatch(RecordingWanted((0,)))
                 fake.step(snapshot=b"")
                 given += 1
                 until_taken(given)  # steps of the previous recording count until they are taken

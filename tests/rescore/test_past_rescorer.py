@@ -66,7 +66,7 @@ class Desk:
         session.do(PauseRun())
         wait_until(session, lambda v: not v.playing, "the pause")
         last = session.view().timeline.last
-        session.happen(EnvsReset())
+        session.dispatch(EnvsReset())
         wait_until(session, lambda v: v.timeline.last > last and v.step.elapsed_steps.max() == 0, "the reset")
         return moments_of(session)
 
@@ -210,7 +210,7 @@ def test_a_rescoring_in_an_endless_loop_can_be_stopped_and_the_next_one_runs(des
     process = background_pid(desk.session)
     desk.session.do(StopRescoring())
     view = desk.rescored("stopped")
-    assert view.done < view.total and view.stopped_by is StoppedBy.HAND
+    assert view.done < view.total and view.stopped_by is StoppedBy.USER
     wait_until(
         desk.session, lambda v: background_pid(desk.session) is None, "the end of the process that hangs"
     )

@@ -254,7 +254,7 @@ def test_each_verdict_is_sent_once_however_often_progress_is_reported(
 class StoringExecutor:
     """An executor that stores its work and does it in this process."""
 
-    elsewhere = True
+    is_remote = True
     work: Work[Any, Any, Any]
 
     def run(self, work: Work[Any, Any, Any], scheduler: Scheduler[Any, Any]) -> None:

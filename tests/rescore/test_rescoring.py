@@ -21,7 +21,7 @@ def test_a_stopped_rescoring_keeps_its_results_and_ignores_late_reports() -> Non
     assert effects == [] and (half.view.state, half.view.done, half.view.total) == ("rescoring", 1, 2)
     stopped, effects = apply_to_job(half, Asked(StopRescoring()))
     assert effects == [EndRescoring()] and stopped.view.serial > half.view.serial
-    assert (stopped.view.state, stopped.view.stopped_by, stopped.view.done) == ("stopped", StoppedBy.HAND, 1)
+    assert (stopped.view.state, stopped.view.stopped_by, stopped.view.done) == ("stopped", StoppedBy.USER, 1)
     late = RescoringUpdate(BEGUN.job, replace(HALF.view, state="done", done=2))
     assert apply_to_job(stopped, late) == (stopped, [])
     with pytest.raises(Refused):

@@ -21,9 +21,9 @@ def test_values_that_only_another_recording_has_are_in_the_table() -> None:
     old = [NumberRow("reward", "0.50", ""), NumberRow("success", "true", "", "good")]
     new = [*old[:1], NumberRow("slope", "0.10", ""), NumberRow("success", "false", "")]
     assert compared(old, [(old, 3), (new, 3)]) == [
-        {"name": "reward", "mood": "", "whole": False, "hint": "", "values": ["0.50", "0.50"]},
-        {"name": "success", "mood": "good", "whole": False, "hint": "", "values": ["true", "false"]},
-        {"name": "slope", "mood": "", "whole": False, "hint": "", "values": ["—", "0.10"]},
+        {"name": "reward", "tone": "", "whole": False, "hint": "", "values": ["0.50", "0.50"]},
+        {"name": "success", "tone": "good", "whole": False, "hint": "", "values": ["true", "false"]},
+        {"name": "slope", "tone": "", "whole": False, "hint": "", "values": ["—", "0.10"]},
     ]
 
 

@@ -120,7 +120,7 @@ def test_each_number_has_a_line_at_its_states() -> None:
 
 
 @pytest.mark.parametrize(
-    ("success", "fail", "most", "mood", "word"),
+    ("success", "fail", "most", "tone", "word"),
     [
         ([0, 0, 1, 1], None, 3, "good", "success"),
         ([0, 1, 1, 0], None, 3, "warn", "1"),
@@ -132,13 +132,13 @@ def test_each_number_has_a_line_at_its_states() -> None:
     ],
 )
 def test_the_outcome_is_that_of_the_last_state(
-    success: list[int] | None, fail: list[int] | None, most: int, mood: str, word: str
+    success: list[int] | None, fail: list[int] | None, most: int, tone: str, word: str
 ) -> None:
     episode = made(3, max_episode_steps=most)
     given = {"success": success, "fail": fail}
     episode.evaluate = {name: np.array(row, bool) for name, row in given.items() if row is not None}
     text, found = outcome_text(episode)
-    assert found == mood and word in text
+    assert found == tone and word in text
 
 
 class Encoded(list[np.ndarray]):

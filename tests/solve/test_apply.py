@@ -118,21 +118,21 @@ def test_a_plan_is_made_with_the_version_and_followed_by_its_envs(
     assert (begin.load.options.num_envs, begin.load.options.seed) == (1, 0)
     assert (begin.options, begin.traced) == (FEW, "cube")
     states = [solving.view.of(SolveView).state]
-    session.happen(PlanActivity("too early"))
+    session.dispatch(PlanActivity("too early"))
     assert not solving.view.of(SolveView).activity, "only the start has a text"
     for event in (RolloutsStart(), PlanActivity("building envs")):
-        session.happen(event)
+        session.dispatch(event)
         states.append(solving.view.of(SolveView).state)
     assert solving.view.of(SolveView).activity == "building envs"
     solving.asked(object)
-    session.happen(PlanMade(wanted, (planned(0, 8.0), planned(2, 2.0)), 123.0))
+    session.dispatch(PlanMade(wanted, (planned(0, 8.0), planned(2, 2.0)), 123.0))
     assert [*states, solving.view.of(SolveView).state] == ["planning", "starting", "starting", "planning"]
     assert not solving.view.of(SolveView).activity
     (follow,) = solving.asked(FollowPlan)
     assert (follow.number, follow.env_idx) == (5, (0, 2))
     assert follow.actions.tolist() == [[[0, 10], [2, 12]], [[20, 30], [22, 32]]]
     solving.step(3, reward=[1, 10, 100])
-    session.happen(PlanMade(wanted, (planned(2, 6.0),), 77.0))
+    session.dispatch(PlanMade(wanted, (planned(2, 6.0),), 77.0))
     solving.step(reward=[3, 30, 300])
     for env, predicted, rewards, step, rate in (
         (0, [2.0, None, None, None], [1, 1, 1, 3], 3, 123.0),
@@ -158,13 +158,13 @@ def test_without_a_plan_the_worker_pauses_and_the_next_request_plans_again(
     for fails in range(2):
         solving.tell(Status(True, 20.0, 1.0), PlanWanted(5 + fails, (0,), b"state", ({},)))
         solving.asked(object)
-        session.happen(PlanFailed("the task raised", PROBLEM))
+        session.dispatch(PlanFailed("the task raised", PROBLEM))
         view = solving.view.of(SolveView)
         assert (view.state, view.why, view.problem) == ("failed", "the task raised", PROBLEM)
         assert [one.playing for one in solving.asked(Play)] == [False]
-        session.happen(PlanFailed("late", None))
-        session.happen(PlanMade(PlanWanted(5, (0,)), (planned(0, 1.0),), 1.0))
-        session.happen(RolloutsStart())
+        session.dispatch(PlanFailed("late", None))
+        session.dispatch(PlanMade(PlanWanted(5, (0,)), (planned(0, 1.0),), 1.0))
+        session.dispatch(RolloutsStart())
         assert solving.view.of(SolveView).why == "the task raised" and not solving.asked(FollowPlan)
     solving.tell(PlanWanted(9, (0,), b"state", ({},)))
     view = solving.view.of(SolveView)
@@ -268,18 +268,18 @@ def test_seeds_are_solved_reported_and_stopped(played: FakeWorkerSession, begun:
     assert isinstance(begin, BeginSeeds) and (begin.task, begin.seeds, begin.plan) == ("push.py", 5, FEW)
     assert (seen().state, seen().total, seen().chosen) == ("starting", 5, 5)
     serial = seen().serial
-    session.happen(SeedsUpdate("importing"))
+    session.dispatch(SeedsUpdate("importing"))
     assert (seen().state, seen().activity) == ("starting", "importing")
-    session.happen(SeedsUpdate("seed 0, step 4", 0.25))
+    session.dispatch(SeedsUpdate("seed 0, step 4", 0.25))
     assert (seen().state, seen().activity, seen().done) == ("solving", "seed 0, step 4", 0.25)
     report = SolveReport((solved(0),), (), 1.0, False, 5)
-    session.happen(SeedsUpdate(report=report))
+    session.dispatch(SeedsUpdate(report=report))
     assert (seen().report, seen().done, seen().activity) == (report, 0.25, "seed 0, step 4")
     assert seen().serial > serial and not seen().stale
     session.do(StopSolving())
     assert begun[1:] == [EndSeeds()] and (seen().state, seen().report) == ("stopped", report)
     for late in (SeedsUpdate("late", 3.0), SeedsDone(), SeedsFailed("late", None)):
-        session.happen(late)
+        session.dispatch(late)
         assert seen().state == "stopped" and not seen().activity
     session.do(StopSolving())
     assert len(begun) == 2
@@ -293,14 +293,14 @@ def test_seeds_are_solved_reported_and_stopped(played: FakeWorkerSession, begun:
         0,
         5,
     )
-    session.happen(SeedsFailed("the task failed", PROBLEM))
+    session.dispatch(SeedsFailed("the task failed", PROBLEM))
     assert (seen().state, seen().why, seen().problem) == ("failed", "the task failed", PROBLEM)
     session.do(SolveSeeds())
     assert (seen().why, seen().problem) == ("", None)
-    session.happen(SeedsUpdate(report=report))
+    session.dispatch(SeedsUpdate(report=report))
     assert (seen().state, seen().report) == ("solving", report)
-    session.happen(SeedsUpdate("seed 4", 4.5))
-    session.happen(SeedsDone())
+    session.dispatch(SeedsUpdate("seed 4", 4.5))
+    session.dispatch(SeedsDone())
     assert (seen().state, seen().activity, len(begun)) == ("done", "", 4)
 
 
@@ -313,7 +313,7 @@ def test_a_press_on_a_seed_opens_its_recording(
     assert not looked
     played.session.do(SolveSeeds())
     report = SolveReport((solved(0), solved(1, 0), solved(2)), (), 1.0, False, 3)
-    played.session.happen(SeedsUpdate(report=report))
+    played.session.dispatch(SeedsUpdate(report=report))
     for seed in (1, 2, 7):
         panel.do(ShowSolved(seed=seed), cast(Any, None))
     assert looked == [Path("1.rrd"), Path("2.rrd")]

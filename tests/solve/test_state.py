@@ -99,7 +99,7 @@ def test_playing_stops_when_the_selected_env_is_solved_and_other_envs_hold_still
     assert np.isfinite(view.of(SolveView).predicted).all() and view.of(SolveView).predicted[
         -1
     ] == pytest.approx(1, abs=0.6)
-    session.happen(SaveWanted((0,)))
+    session.dispatch(SaveWanted((0,)))
     view = wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the recording")
     assert view.of(RecordingStatus).episodes_written == 1 and not view.of(RecordingStatus).saving.failed, (
         "the recording must be stored like any other"

@@ -332,7 +332,7 @@ class Page:
         """Set the number of browsers that show the page. At 0, nothing is rendered."""
         if visitors != self._visitors_counted:
             self._visitors_counted = visitors
-            self._session.happen(PagesCounted(visitors))
+            self._session.dispatch(PagesCounted(visitors))
             self._hands.follow(self._session.view())
             self._reach.follow()
 
@@ -572,7 +572,7 @@ class Page:
             return
         ray = np.array(event.ray_origin), np.array(event.ray_direction)
         if (camera := self._frustums.under_ray(*ray)) is not None:
-            self._session.happen(CameraChosen(camera))
+            self._session.dispatch(CameraChosen(camera))
             return
         if (reset := self._resets.reset_under_ray(*ray)) is not None:
             self._session.do(reset)

@@ -88,8 +88,8 @@ class Marks(PagePart[SessionView]):
         moved = moved_cameras(self._session.view())
         if not moved:
             return
-        self._session.happen(CameraChosen(moved[0]))
-        self._session.happen(EditWanted(EditRequest("edit", moved[0])))
+        self._session.dispatch(CameraChosen(moved[0]))
+        self._session.dispatch(EditWanted(EditRequest("edit", moved[0])))
         self._tabs.open(visitor, CAMERAS)
 
 

@@ -94,7 +94,7 @@ class Session:
     """One task, one worker, any number of pages. All methods may be called on any thread; all but `wait` and
     `close` return at once.
 
-    Its state is one value, which changes on the loop (`machine.loop`): `happen` takes an event, `apply` returns the next
+    Its state is one value, which changes on the loop (`machine.loop`): `dispatch` takes an event, `apply` returns the next
     state and the effects, and `_perform` starts each effect. Nothing waits for the env. When the worker dies, `Supervisor`
     starts another, which loads the last good version; pages stay open.
     """
@@ -160,28 +160,28 @@ class Session:
             first_requests=self._first_requests,
             on_event=self._take,
             on_death=self._on_death,
-            on_busy=lambda busy: self.happen(WorkerBusy(busy)),
+            on_busy=lambda busy: self.dispatch(WorkerBusy(busy)),
             own_files=lambda: self.look(lambda run: run.own_files),
             texts=lambda loading: self.look(lambda run: executed_texts(run, loading)),
             output=self._printed.feed,
         )
         self._background = Background()
         """Sends questions to the background process."""
-        self._checks = CheckJobs(self._background, self._happen)
-        self._profiles = ProfileJobs(self._background, self._happen)
-        self._plans = PlanJobs(self._happen)
-        self._seeds = SeedsJobs(recordings, self._happen)
-        self._policies = PolicySearch(self._happen)
-        self._resets = ResetJobs(self._background, self._happen)
-        self._searches = SearchJobs(self._background, self._happen)
-        self._starts = StartJobs(self._background, self._happen)
-        self._spawns = SpawnJobs(self._background, self._happen)
+        self._checks = CheckJobs(self._background, self._dispatch)
+        self._profiles = ProfileJobs(self._background, self._dispatch)
+        self._plans = PlanJobs(self._dispatch)
+        self._seeds = SeedsJobs(recordings, self._dispatch)
+        self._policies = PolicySearch(self._dispatch)
+        self._resets = ResetJobs(self._background, self._dispatch)
+        self._searches = SearchJobs(self._background, self._dispatch)
+        self._starts = StartJobs(self._background, self._dispatch)
+        self._spawns = SpawnJobs(self._background, self._dispatch)
         self._asker = QuestionClient(self._send)
-        self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
+        self._studio = StudioJobs(self._asker, self._background, self._notify, self._dispatch)
         # Created after the parts above, since it reports recovered episodes at once.
-        self._recorder = LiveRecorder(recordings, self._happen, on_notice)
-        self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
-        self._past_rescorer = PastRescorer(self._background, self._happen)
+        self._recorder = LiveRecorder(recordings, self._dispatch, on_notice)
+        self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._dispatch)
+        self._past_rescorer = PastRescorer(self._background, self._dispatch)
         listen(self._log)
         self._watcher.follow(watched_files(self._run))
         self._worker.start()
@@ -197,18 +197,18 @@ class Session:
         Raises:
             Refused: the command makes no sense now; nothing has changed.
         """
-        self.happen(Asked(command, page))
+        self.dispatch(Asked(command, page))
 
-    def happen(self, event: SessionEvent) -> None:
+    def dispatch(self, event: SessionEvent) -> None:
         """Handle an event: a command of a page, a message of the worker, a saved file.
 
         Raises:
             Refused: a command makes no sense now; nothing has changed.
         """
-        for begun in do(lambda: self._happen(event)):
-            wait_for_disk(begun)  # a file that is saved after `happen` has returned must be noticed
+        for begun in do(lambda: self._dispatch(event)):
+            wait_for_disk(begun)  # a file that is saved after `dispatch` has returned must be noticed
 
-    def _happen(self, event: SessionEvent) -> list[Future[None]]:
+    def _dispatch(self, event: SessionEvent) -> list[Future[None]]:
         """Handle an event; returns the work started off the loop. If an effect fails, the others are still
         performed. The failure is raised if the event is a command; otherwise, it is reported."""
         before, begun, failure = self._state, list[Future[None]](), None
@@ -245,9 +245,9 @@ class Session:
             case FollowPolicy(policy=policy, folder=folder):
                 return self._aside.begin(partial(self._policy_file.follow, policy, folder))
             case Then(event=event):
-                self._happen(event)
+                self._dispatch(event)
             case Later(seconds=seconds, event=event):
-                later(seconds, lambda: self._happen(event))
+                later(seconds, lambda: self._dispatch(event))
             case BeginCheck() | EndCheck():
                 self._checks.perform(effect)
             case KeepCheckAfterSave(wanted=wanted):
@@ -371,7 +371,7 @@ class Session:
 
     def change(self, **settings: Any) -> None:
         """Change fields of `Settings`."""
-        self.happen(SettingsChanged(settings))
+        self.dispatch(SettingsChanged(settings))
 
     @on_loop
     def clear_printed(self) -> None:
@@ -388,7 +388,7 @@ class Session:
     ) -> int:
         """See `RunToEnter`; returns its number."""
         number = next(self._enter_numbers)
-        self.happen(RunToEnter(run, number, everywhere, source_file, source))
+        self.dispatch(RunToEnter(run, number, everywhere, source_file, source))
         return number
 
     @on_loop
@@ -474,7 +474,7 @@ class Session:
     def _died(self, death: Death) -> tuple[Problem | None, bool]:
         """Returns the problem to show, if any, and whether there is a version to restore."""
         before = self._run.problem_serial
-        self._happen(WorkerDied(death, self._printed.tail(20)))
+        self._dispatch(WorkerDied(death, self._printed.tail(20)))
         run = self._run
         return run.problem if run.problem_serial != before else None, run.task is not None
 
@@ -486,37 +486,37 @@ class Session:
         """
         match event:
             case TaskFailed() if self._worker.load_pending and event.problem.interrupted:
-                self._happen(LoadPreempted(event))
+                self._dispatch(LoadPreempted(event))
                 return False  # interrupted because a newer version waits: no failure to report
             case Loaded():
                 self._on_loaded(event, on_disk)
             case Stepped():
-                self._happen(event)
+                self._dispatch(event)
             case Answer() | Progress():
                 self._asker.take(event)
                 self._notify()
             case _:
-                self._happen(event)
+                self._dispatch(event)
         return True
 
     def _on_loaded(self, event: Loaded, on_disk: bool) -> None:
         self._worker.reset_deaths()
-        self._happen(VersionLoaded(event, on_disk))
-        self._happen(LoadDone())
+        self._dispatch(VersionLoaded(event, on_disk))
+        self._dispatch(LoadDone())
 
     # --- files and output ----------------------------------------------------------------------------
 
     @on_loop
     def _on_files_changed(self, paths: set[Path]) -> None:
         """A watched file was saved."""
-        self._happen(FileSaved())
+        self._dispatch(FileSaved())
 
     def _on_policy_saved(self) -> None:
         """Reload the policy. Called on the watcher's thread."""
         # A policy in the task's folder is also watched as a module of the task, and that watcher reports
         # "nothing changed". So the log names the reload of the policy.
         self._log("the policy's file was saved: it is read again")
-        self.happen(PolicySaved())
+        self.dispatch(PolicySaved())
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
         self._notify()

@@ -107,7 +107,7 @@ class State:
     search: of_search.ResetSearch = of_search.ResetSearch()
     """The search for a first state that meets a condition."""
     start_edit: of_start.StartEdit = of_start.StartEdit()
-    """The change of the file that makes episodes begin elsewhere."""
+    """The edit of the file that changes where episodes start."""
     spawn: of_spawn.SpawnBox = of_spawn.SpawnBox()
     """The range in which resets put a body."""
 

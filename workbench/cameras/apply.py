@@ -306,18 +306,18 @@ class StudioJobs:
         asker: QuestionClient,
         background: Background,
         on_change: Callable[[], None],
-        happen: Callable[[StudioEvent | FileOpened], object],
+        dispatch: Callable[[StudioEvent | FileOpened], object],
     ) -> None:
         """
         Args:
             asker, background: the first asks the worker that plays, the second the background process.
             on_change: called when `progress` has changed.
-            happen: handles the resulting events.
+            dispatch: handles the resulting events.
         """
-        self._asker, self._happen = asker, happen
-        self._file, self._reports = FileEdits(asker, happen), CameraReports(asker, background, happen)
+        self._asker, self._dispatch = asker, dispatch
+        self._file, self._reports = FileEdits(asker, dispatch), CameraReports(asker, background, dispatch)
         self._lanes: dict[Lane, Jobs] = {
-            lane: Jobs(on_change, lambda failure, lane=lane: happen(WorkFailed(lane, str(failure))))
+            lane: Jobs(on_change, lambda failure, lane=lane: dispatch(WorkFailed(lane, str(failure))))
             for lane in get_args(Lane)
         }
 
@@ -357,7 +357,7 @@ class StudioJobs:
                 self._file.begin(effect)
 
     async def _draw_preview(self, question: DrawCamera) -> None:
-        self._happen(PreviewDrawn(await self._asker.ask(question)))
+        self._dispatch(PreviewDrawn(await self._asker.ask(question)))
 
     def close(self) -> None:
         """Cancel all jobs, and wait for a running edit. Must not be called on the loop's thread."""

@@ -72,7 +72,7 @@ class CameraCompare(PagePart[SessionView]):
                 self._compare()
             case ReturnToKept():
                 camera, _ = chosen_camera(self._session)
-                self._session.happen(CameraPlaced(camera.key, self._kept_of(camera)))
+                self._session.dispatch(CameraPlaced(camera.key, self._kept_of(camera)))
 
     def _kept_of(self, camera: StudioCamera) -> CameraSettings:
         if camera.key not in self._kept:
@@ -92,7 +92,7 @@ class CameraCompare(PagePart[SessionView]):
             )
         self._asked = (camera.key, now, other, NAMES[self._other])
         self._pair.asked(self._session.view().of(StudioView).results.compared)
-        self._session.happen(ComparisonWanted(other))
+        self._session.dispatch(ComparisonWanted(other))
 
     def _note_file(self, cameras: tuple[StudioCamera, ...]) -> None:
         for camera in cameras:

@@ -45,17 +45,17 @@ class FileEdits:
 
     Args:
         asker: asks questions of the worker that plays.
-        happen: handles the resulting events.
+        dispatch: handles the resulting events.
         patience: timeout in seconds for the worker to run the hooks, which may loop for ever.
     """
 
     def __init__(
         self,
         asker: QuestionClient,
-        happen: Callable[[StudioEvent | FileOpened], object],
+        dispatch: Callable[[StudioEvent | FileOpened], object],
         patience: float = 60.0,
     ) -> None:
-        self._asker, self._happen, self._patience = asker, happen, patience
+        self._asker, self._dispatch, self._patience = asker, dispatch, patience
         self._stopped = threading.Event()
         """Cancels the present question."""
         self._aside = BlockingPool("edits")
@@ -73,7 +73,7 @@ class FileEdits:
     async def _find_plan(self, wanted: FindPlan) -> None:
         run_hooks = partial(self._run, wanted.load)
         found = await self._aside.run(partial(plan, wanted.task, wanted.info, wanted.request, run_hooks))
-        self._happen(PlanFound(wanted.request, found))
+        self._dispatch(PlanFound(wanted.request, found))
 
     def _run(self, load: Load | None, texts: Mapping[str, str]) -> HookCameras:
         """Run the hooks of these texts; called off the loop."""
@@ -100,22 +100,22 @@ class FileEdits:
         try:
             await self._aside.run(partial(change, wanted.edit))
         except RefusedEdit as refused:
-            self._happen(FileNotChanged(refused.reason))
+            self._dispatch(FileNotChanged(refused.reason))
         else:
-            self._happen(FileChanged())
+            self._dispatch(FileChanged())
 
     async def _copy(self, wanted: CopyToFolder) -> None:
         file, state = await self._aside.run(partial(copy, wanted.task, wanted.folder))
-        self._happen(TaskCopied(file, state))
+        self._dispatch(TaskCopied(file, state))
         if file is not None:
-            self._happen(FileOpened(file, wanted.task.class_name))
+            self._dispatch(FileOpened(file, wanted.task.class_name))
 
     async def _reported(self, work: Coroutine[Any, Any, None]) -> None:
         try:
             await work
         except Exception as error:
             report_failure("An edit of the task's file failed", error)
-            self._happen(EditFailed(repr(error)))
+            self._dispatch(EditFailed(repr(error)))
 
     async def draw(self, job: Job, wanted: DrawNewCamera) -> None:
         """Draw the picture of a new camera; cancelled by the next request."""
@@ -123,7 +123,7 @@ class FileEdits:
         try:
             picture = await self._asker.ask(wanted.question)
         finally:
-            self._happen(NewCameraDrawn(wanted.request, picture))
+            self._dispatch(NewCameraDrawn(wanted.request, picture))
 
     def stop_question(self) -> None:
         """Cancel the present question, because the worker has ended or another version is loading."""
@@ -136,5 +136,5 @@ class FileEdits:
 
     def _close(self) -> None:
         self._closing = True
-        self._happen(StudioClosed())
+        self._dispatch(StudioClosed())
         self.stop_question()

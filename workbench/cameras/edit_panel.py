@@ -44,7 +44,7 @@ from workbench.page.widgets.visitors import Visitor
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, pose_of, vertical_fov
 
 LEAVE, CLOSE = "Discard the change", "Close"
-MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
+TONES = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
 NOTHING = EditState()
 
 
@@ -120,7 +120,7 @@ def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = Fals
         message="The camera was moved after this change was planned: show the change again."
         if stale
         else edit_state.message,
-        mood="warn" if stale else MOODS.get(edit_state.stage, "plain"),
+        tone="warn" if stale else TONES.get(edit_state.stage, "plain"),
         about=edit_state.request.about if planned and edit_state.request is not None else "",
         picture="" if seen is None else data_address(seen, PREVIEW_PIXELS),
         drawing=settings if planned and edit_state.drawing else None,
@@ -246,7 +246,7 @@ class WriteToFile(PagePart[SessionView]):
         """Request a plan. Stores the present edit state first, since the answer may arrive at once."""
         change = self._change if request.what == "edit" else self._member_change
         change.arrival.asked(self._session.view().of(StudioView).edit_state)
-        self._session.happen(EditWanted(request))
+        self._session.dispatch(EditWanted(request))
 
     def _add(self, kind: CameraKind, client: viser.ClientHandle) -> None:
         view = self._session.view()

@@ -168,7 +168,7 @@ class CameraExport(PagePart[SessionView]):
             pose = calibrated_pose(camera, self._text, self._direction, self._convention, UNITS[self._units])
         except ValueError as reason:
             raise Refused(sentence(str(reason))) from None
-        self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
+        self._session.dispatch(CameraPlaced(camera.key, frames.with_pose(now, pose)))
         client.add_notification(
             "Placed",
             "The pose was applied; the lens was not. If the calibration has an intrinsic matrix, enter it under Lens "

@@ -236,7 +236,7 @@ class Placing:
         """
         if not all(abs(x) <= MAX_COORDINATE_METRES for x in settings.position):
             raise Refused(f"A camera must be within {MAX_COORDINATE_METRES:g} m of the origin.")
-        self._session.happen(CameraPlaced(key, settings, control, pause))
+        self._session.dispatch(CameraPlaced(key, settings, control, pause))
 
     def change(self, control: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
         """Apply `change` to the chosen camera; `control` as in `place`.

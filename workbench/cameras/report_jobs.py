@@ -44,14 +44,14 @@ class CameraReports:
     """Asks the questions for reports. Its methods are called on the loop."""
 
     def __init__(
-        self, asker: QuestionClient, background: Background, happen: Callable[[StudioEvent], object]
+        self, asker: QuestionClient, background: Background, dispatch: Callable[[StudioEvent], object]
     ) -> None:
         """
         Args:
             asker, background: the first asks the worker that plays, the second the background process.
-            happen: handles the resulting events.
+            dispatch: handles the resulting events.
         """
-        self._live, self._background, self._happen = asker, background, happen
+        self._live, self._background, self._dispatch = asker, background, dispatch
 
     async def measure_live(self, job: Job, wanted: MeasureLive) -> None:
         with self._measuring():
@@ -77,11 +77,11 @@ class CameraReports:
     @contextmanager
     def _measuring(self) -> Iterator[None]:
         """Mark the report as old until a new one arrives or the job ends."""
-        self._happen(Measuring(True))
+        self._dispatch(Measuring(True))
         try:
             yield
         finally:
-            self._happen(Measuring(False))
+            self._dispatch(Measuring(False))
 
     async def _measure(
         self,
@@ -106,7 +106,7 @@ class CameraReports:
             if len(reports) % every == 0 or len(reports) == total:
                 seeds = len(reports) if isinstance(wanted, MeasureSeeds) else 0
                 report, of = join_reports(reports), wanted.question.key
-                self._happen(ReportMade(report, of, wanted.settings, seeds, tuple(moments)))
+                self._dispatch(ReportMade(report, of, wanted.settings, seeds, tuple(moments)))
 
     async def suggest(self, job: Job, wanted: Suggest) -> None:
         async def search() -> tuple[OfferedPlacement, ...]:
@@ -120,18 +120,18 @@ class CameraReports:
             )
 
         found = await self._background.in_turns(job, search)
-        self._happen(SuggestionsFound(found, wanted.space.objects))
+        self._dispatch(SuggestionsFound(found, wanted.space.objects))
 
     async def compare(self, job: Job, wanted: Compare) -> None:
         moment = wanted.moment
         now = await self._draw(moment, DrawCamera(wanted.key, None, moment.env))
         other = await self._draw(moment, DrawCamera(wanted.key, wanted.other, moment.env))
-        self._happen(PicturesCompared(now, other))
+        self._dispatch(PicturesCompared(now, other))
 
     async def draw_envs(self, job: Job, wanted: DrawEnvs) -> None:
         for done, env in enumerate(wanted.env_idx):
             job.report(done, len(wanted.env_idx))
-            self._happen(
+            self._dispatch(
                 SheetPictureDrawn(await self._draw(wanted.moment, DrawCamera(wanted.key, None, env)))
             )
 
@@ -139,7 +139,7 @@ class CameraReports:
         question = DrawCamera(wanted.info.key, None, wanted.moment.env, ("depth", "segmentation"))
         picture = await self._draw(wanted.moment, question)
         picked = pick_pixel(wanted.info, picture, wanted.u, wanted.v, wanted.segmentation)
-        self._happen(PixelPicked(picked))
+        self._dispatch(PixelPicked(picked))
 
     async def _draw(self, moment: ShownMoment, question: DrawCamera) -> Picture:
         return await self._live.ask(replace(question, poses=moment.of(question.env)))

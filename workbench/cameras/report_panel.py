@@ -112,10 +112,10 @@ class CameraReportPanel(PagePart[SessionView]):
             case MeasureChosenCamera():
                 self._report.asked(studio.results.report)
                 most = self._steps if self._over == "steps" else self._resets
-                self._session.happen(MeasureWanted(self._over, most))
+                self._session.dispatch(MeasureWanted(self._over, most))
             case DrawSheet():
                 self._pictures.asked(studio.results.sheet)
-                self._session.happen(SheetWanted())
+                self._session.dispatch(SheetWanted())
             case ShowMeasuredMoment(number=number):
                 self._show_moment(number)
             case UseSuggestedPlane(plane=plane):
@@ -124,7 +124,7 @@ class CameraReportPanel(PagePart[SessionView]):
     def _show_moment(self, position: int) -> None:
         moments = self._session.view().of(StudioView).results.report_moments
         if 0 <= position < len(moments):
-            self._session.happen(MomentShown(moments[position].serial, moments[position].env))
+            self._session.dispatch(MomentShown(moments[position].serial, moments[position].env))
 
     def _use(self, plane: str) -> None:
         studio = self._session.view().of(StudioView)
@@ -134,7 +134,7 @@ class CameraReportPanel(PagePart[SessionView]):
         near = report.depth.suggested_near if plane == "near" else camera.now.near
         far = report.depth.suggested_far if plane == "far" else camera.now.far
         if near is not None and far is not None and near < far:
-            self._session.happen(CameraPlaced(camera.key, replace(camera.now, near=near, far=far)))
+            self._session.dispatch(CameraPlaced(camera.key, replace(camera.now, near=near, far=far)))
 
     # --- drawing -------------------------------------------------------------------------------------
 
@@ -297,7 +297,7 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
     """Table rows: the objects to see, least visible first; then the objects that the task hides. No scenery.
 
     In a row, ``bad`` names the columns (``seen``, ``cut``, ``hidden``) that the author should check.
-    ``moods`` has the visibility in each picture: ``good``, ``warn`` (cut, or much hidden), ``bad`` (not
+    ``tones`` has the visibility in each picture: ``good``, ``warn`` (cut, or much hidden), ``bad`` (not
     visible) or ``none`` (absent).
 
     Args:
@@ -332,7 +332,7 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
                 "cut": percent(found.cut),
                 "hidden": percent(found.hidden),
                 "bad": bad,
-                "moods": [_mood(thing, i) for i in range(len(report.envs))],
+                "tones": [_mood(thing, i) for i in range(len(report.envs))],
             }
         )
     hides = "the task hides it from this camera"

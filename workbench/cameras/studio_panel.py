@@ -164,7 +164,7 @@ class StudioPanel(PagePart[SessionView]):
 
     def unfold(self) -> None:
         """Handle the opening of the tab; the task may not be loaded yet."""
-        self._session.happen(StudioOpened())
+        self._session.dispatch(StudioOpened())
 
     @property
     def shows(self) -> str:
@@ -342,7 +342,7 @@ class StudioPanel(PagePart[SessionView]):
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
             case ChooseCamera(name=name):
-                self._session.happen(CameraChosen(self._key_of(name)))
+                self._session.dispatch(CameraChosen(self._key_of(name)))
             case ToggleLookThrough():
                 self._look.toggle(visitor.client)
             case MoveCameraToView():

@@ -155,7 +155,7 @@ class CameraSuggest(PagePart[SessionView]):
             raise Refused("Choose at least one object that must be visible.")
         self._offers.asked(view.of(StudioView).results.suggestions)
         low, high = ordered(self._box_of(camera, now))
-        self._session.happen(SuggestionsWanted(wanted, low, high, self._resets))
+        self._session.dispatch(SuggestionsWanted(wanted, low, high, self._resets))
 
     def _wanted_of(self, key: CameraKey | None, choices: tuple[VisibleObject, ...]) -> frozenset[str]:
         by_default = frozenset(choice.name for choice in choices if choice.first)

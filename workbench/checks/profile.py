@@ -112,13 +112,13 @@ class ProfileJobs:
     """Performs the effects: one job at a time, at the priority of jobs that a person waits for. Used on the
     loop, except `close`."""
 
-    def __init__(self, process: Background, happen: Callable[[ProfileEvent], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[ProfileEvent], object]) -> None:
         """
         Args:
             process: the background process in which a job runs.
-            happen: handles the events of a job.
+            dispatch: handles the events of a job.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._jobs = Jobs(lambda: None, self._failed)
 
     def perform(self, effect: ProfileEffect) -> None:
@@ -137,7 +137,7 @@ class ProfileJobs:
             await load_version(self._process, job, load)
             return await self._process.ask(ProfileStep())
 
-        self._happen(StepTimed(await self._process.in_turns(job, ask)))
+        self._dispatch(StepTimed(await self._process.in_turns(job, ask)))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(ProfileFailed(str(failure), failure.problem))
+        self._dispatch(ProfileFailed(str(failure), failure.problem))

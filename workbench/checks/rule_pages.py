@@ -22,7 +22,7 @@ class RulePage:
     """The parts of a rule's page that the Checks tab shows, as HTML."""
 
     why: str
-    mend: str
+    fix: str
     address: str
     """Address of the whole page."""
 
@@ -36,7 +36,7 @@ def rule_page(rule: str) -> RulePage | None:
     if not file.is_file():
         return None
     parts = sections(file.read_text(encoding="utf-8"))
-    return RulePage(as_html(parts.get("Why", "")), as_html(parts.get("Mend", "")), f"{HELP}{rule}")
+    return RulePage(as_html(parts.get("Why", "")), as_html(parts.get("Fix", "")), f"{HELP}{rule}")
 
 
 def sections(text: str) -> dict[str, str]:

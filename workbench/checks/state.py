@@ -168,7 +168,7 @@ def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
                 raise Refused("No task is loaded yet.")
             return _check(checks, load)
         case Asked(command=StopChecks()):
-            return _stop(checks, StoppedBy.HAND)
+            return _stop(checks, StoppedBy.USER)
         case FileSaved():
             return _stop(checks, StoppedBy.SAVE)
         case Asked(command=CheckAfterSave(on=wanted)):
@@ -265,13 +265,13 @@ class CheckJobs:
     was interrupted is requested again without the rules that already have a result.
     """
 
-    def __init__(self, process: Background, happen: Callable[[CheckEvent], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[CheckEvent], object]) -> None:
         """
         Args:
             process: where the checks run; other jobs come first.
-            happen: handles the events of the check.
+            dispatch: handles the events of the check.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._jobs = Jobs(self._on_progress, self._failed)
 
     def perform(self, effect: CheckEffect) -> None:
@@ -295,13 +295,13 @@ class CheckJobs:
         def checked(result: RuleResult, total: int | None = None) -> None:
             done.add(result.rule)
             seconds = time.monotonic() - (began or time.monotonic())
-            self._happen(RuleChecked(result, seconds, total))
+            self._dispatch(RuleChecked(result, seconds, total))
 
         async def ask(group: int) -> CheckedGroup:
             nonlocal began
             await load_version(self._process, job, load)
             began = began or time.monotonic()
-            self._happen(GroupBegan())
+            self._dispatch(GroupBegan())
             return await self._process.ask(CheckGroup(group, degrees, tuple(done)), on_progress)
 
         def on_progress(count: int, total: int, now: RuleProgress) -> None:
@@ -329,15 +329,15 @@ class CheckJobs:
                 under_way = None
                 continue
             group, groups = group + 1, answer.groups
-            self._happen(GroupChecked(answer.rules, answer.next))
-        self._happen(CheckDone())
+            self._dispatch(GroupChecked(answer.rules, answer.next))
+        self._dispatch(CheckDone())
 
     def _on_progress(self) -> None:
         progress = self._jobs.progress
-        self._happen(CheckWaits(progress is not None and progress.what == WAITING))
+        self._dispatch(CheckWaits(progress is not None and progress.what == WAITING))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(CheckFailed(str(failure), failure.problem))
+        self._dispatch(CheckFailed(str(failure), failure.problem))
 
 
 async def load_version(process: Background, job: Job, load: Load) -> None:

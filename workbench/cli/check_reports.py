@@ -356,7 +356,7 @@ def _error_result(reported: Reported, error: Problem, root: Path) -> dict[str, A
 def _sarif_rule(rule_id: str) -> dict[str, Any]:
     rule = RULES[rule_id]
     page = find_topic(rule_id)
-    words = f"{rule.asks} Otherwise: {rule.otherwise}"
+    words = f"{rule.asks} If broken: {rule.otherwise}"
     return {
         "id": rule.id,
         "shortDescription": {"text": rule.asks},

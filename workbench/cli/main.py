@@ -46,8 +46,8 @@ def start(
     trust: bool = False,
     editor: str = "vscode",
 ) -> int:
-    """Choose a task on a page: recent ones, the files of this folder, ManiSkill's own. The default command: workbench
-    --port 8081 does the same.
+    """Open a page for choosing a task: recent ones, the files of this folder, ManiSkill's tasks. The default command:
+    workbench --port 8081 is the same as workbench start --port 8081.
 
     Args:
         recordings: folder for recorded episodes.

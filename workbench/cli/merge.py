@@ -88,7 +88,9 @@ def _require_known(merged: JobParts, output: MergeOutput) -> None:
     for name in ("json_file", "csv_file", "junit", "sarif"):
         if getattr(output, name) is not None and name not in _WRITES[merged.command]:
             option = name.replace("_", "-")
-            raise JobFileError(f"workbench {merged.command} does not write such a file: leave out --{option}")
+            raise JobFileError(
+                f"--{option} does not apply to results of workbench {merged.command}: leave it out"
+            )
 
 
 def _together(merged: JobParts, out: Path | None) -> JobParts:

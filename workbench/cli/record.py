@@ -75,7 +75,7 @@ class RecordBar:
         self.stop_requested = False
         self._began: float | None = None
         """Time when the first episode began."""
-        self._said = time.monotonic()
+        self._last_printed = time.monotonic()
         """Time when something other than the bar was last printed."""
 
     def __enter__(self) -> RecordBar:
@@ -99,7 +99,7 @@ class RecordBar:
         """Print a progress line if stderr is not a terminal: in a file the bar is drawn only once, at the
         end, so a log would be silent for hours."""
         if not err.is_terminal:
-            self._said = time.monotonic()
+            self._last_printed = time.monotonic()
             err.print(escape(line), soft_wrap=True)
 
     def show(self, now: RecordProgress) -> None:
@@ -116,7 +116,7 @@ class RecordBar:
             failed = sum(len(failure.numbers) for failure in now.failures)
             doing = f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else "")
             self.describe(doing)
-            if time.monotonic() - self._said > _LOG_SECONDS:
+            if time.monotonic() - self._last_printed > _LOG_SECONDS:
                 self._print_progress(doing)
         if now.over is not None:
             number, kept = now.over

@@ -135,7 +135,7 @@ def _caught_note(refusal: CoreRefusal) -> ErrorNote | None:
     at = refusal.place or next((place for place in reversed(frames) if not is_installed(place[0])), caught)
     text = " ".join(str(refusal).split())
     text = text if len(text) <= _MAX_CHARACTERS else text[: _MAX_CHARACTERS - 1] + "…"
-    where = "there" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
+    where = "in the same line" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
     return ErrorNote(
         f"Before this, the workbench refused {_text_of(at)}, and the task caught the error {where}: {text}",
         at,

@@ -36,7 +36,7 @@ class Rule:
     degree: Degree
     """Default degree."""
     hook: str
-    """The hook in which an author mends a breach; ``class`` for the class and its file."""
+    """The hook in which an author fixes a violation; ``class`` for the class and its file."""
     asks: str
     """What the task must do, in a sentence."""
     otherwise: str
@@ -50,7 +50,7 @@ class DeclaredRule(Rule):
     """A rule with its page, as the code declares it."""
 
     page: str
-    """The sections *Why*, *Mend* and *How it is checked*, as Markdown."""
+    """The sections *Why*, *Fix* and *How it is checked*, as Markdown."""
 
 
 def declared_rule(id: str, degree: Degree, hook: str, text: str, *, solve: bool = False) -> DeclaredRule:
@@ -209,7 +209,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             Their bodies jump, and the policy gets a transition that no action caused. With 4096 envs some env
             is reset at nearly every step, so nearly every episode is spoilt.
 
-            ## Mend
+            ## Fix
             Give setters the rows of `env_idx`; ManiSkill's setters then reach those envs only.
 
             ```python fragment
@@ -241,7 +241,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             a mismatch of sizes, or indexes the row of another env. The first reset, which is of all envs,
             does not show the mistake.
 
-            ## Mend
+            ## Fix
             Make the tensor for all envs once, and write the rows of `env_idx`.
 
             ```python fragment
@@ -275,7 +275,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             include it. On the CPU each env has its own physics, and only the envs that are being reset are
             stepped. The habit comes from tasks with one env, where it is not a mistake.
 
-            ## Mend
+            ## Fix
             Compute the settled pose and place the bodies there, slightly above the surface that carries them.
 
             ```python fragment
@@ -305,7 +305,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             apply writes the whole tensors to the simulation. So everything that moved in that step is put
             back, in all envs: the bodies do not move, or jitter.
 
-            ## Mend
+            ## Fix
             Fetch, write, apply, and fetch again.
 
             ```python fragment
@@ -339,7 +339,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             objects, so the task runs here: a drive target that is set in the build stays, and a pose that is
             read is the initial one.
 
-            ## Mend
+            ## Fix
             Give a body its place with `builder.initial_pose`. In `_after_reconfigure` set what stays, and in
             `_initialize_episode` what each episode begins with.
 
@@ -367,7 +367,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             them out, and so does the batched CPU, for the envs that are being reset. If a call gives rows of
             all envs while some are reset, the batched CPU takes the rows of the envs that are reset.
 
-            ## Mend
+            ## Fix
             Make the call while the scene is built, with a value for each env. Build a body that moves with
             `build_kinematic` or `build`. In `_initialize_episode` take the rows of `env_idx`.
 
@@ -394,7 +394,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             runs with one env and cannot be trained on a GPU. The workbench opens the task with one env, and
             says so.
 
-            ## Mend
+            ## Fix
             Use what ManiSkill has for a batch: contact impulses between two bodies, or on one body.
 
             ```python fragment
@@ -421,7 +421,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             count of steps in success starts over. Nothing raises, and the success rate is lower than it
             should be.
 
-            ## Mend
+            ## Fix
             Write the rows of `env_idx` only.
 
             ```python fragment
@@ -452,7 +452,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             that env's episode ends. So an env behaves differently next to other envs, and its episodes cannot
             be reproduced.
 
-            ## Mend
+            ## Fix
             Apply right after the write, and fetch.
 
             ```python fragment
@@ -484,7 +484,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             one; after the next fetch it is drawn at its old pose again. On the CPU of stock ManiSkill the same line works,
             so the mistake shows first on the cluster.
 
-            ## Mend
+            ## Fix
             Apply and fetch after the write. If only pictures should show the pose, say so with a comment that
             silences the rule.
 
@@ -515,7 +515,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             set it alone: the number stays in the tensor until the next fetch overwrites it. Pictures taken
             before that show the link in the wrong place.
 
-            ## Mend
+            ## Fix
             Set the qpos of the articulation, or its root pose.
 
             ```python fragment
@@ -544,7 +544,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             same line reads new ones, so a controller or a check in such a hook works there and lags by a step
             on the GPU.
 
-            ## Mend
+            ## Fix
             Fetch before you read, in hooks that run between substeps.
 
             ```python fragment
@@ -574,7 +574,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             right after `set_qpos` is the one from before. Objects that are placed relative to it stand in the
             wrong place in each episode, and only on the GPU.
 
-            ## Mend
+            ## Fix
             Apply, update the kinematics and fetch before you read links.
 
             ```python fragment
@@ -606,7 +606,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             simulate when ManiSkill runs on the GPU. The line does nothing there, without an error. On the CPU
             it works for the one env that the object belongs to.
 
-            ## Mend
+            ## Fix
             Use the setters of ManiSkill's `Actor`, `Link` and `Articulation`: they write all envs, or those
             that are being reset.
 
@@ -637,7 +637,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             controller does not either, each step of its robot raises AttributeError on a GPU. On the CPU
             nothing reads them.
 
-            ## Mend
+            ## Fix
             Give the class both, as ManiSkill's own controllers do.
 
             ```python fragment
@@ -664,7 +664,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             succeeds, all 4096 are reset. A tensor of shape (N, 1) becomes (N, N) in the first operation with
             a tensor of shape (N,).
 
-            ## Mend
+            ## Fix
             Reduce over the last dimension, not over the envs, and return bool tensors of shape (N,).
 
             ```python fragment
@@ -691,7 +691,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             ManiSkill's `step` accepts numbers for them. Its wrappers do not: `ManiSkillVectorEnv` with
             `record_metrics=True` uses them as a mask, and fails or picks the wrong rows.
 
-            ## Mend
+            ## Fix
             Compare, or append `.bool()`.
 
             ```python fragment
@@ -716,7 +716,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             a mean over 16 million wrong numbers, and nothing raises. A reward of integers or bools fails in
             trainers that add noise or scale in place.
 
-            ## Mend
+            ## Fix
             Return a floating tensor of shape (N,).
 
             ```python fragment
@@ -747,7 +747,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             is broadcast, so that all envs see the same number, or the join fails with a message about sizes
             that names no leaf.
 
-            ## Mend
+            ## Fix
             Return a dict of tensors of shape (N, ...); repeat a value that is the same for all envs.
 
             ```python fragment

@@ -69,7 +69,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             running means and the value function. Most often bodies overlap, or a force is too high. The same
             scene explodes more often on the GPU.
 
-            ## Mend
+            ## Fix
             Make sure that no bodies overlap and none is thrown. If a body may be lost, end the episode there.
 
             ```python fragment
@@ -99,7 +99,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             makes it NaN. A comparison with NaN is false, so a success that is computed from it is never
             reached. The reward often uses the same number.
 
-            ## Mend
+            ## Fix
             Clamp divisors and the arguments of roots. For a value that is not known, return 0 and a bool that
             says so.
 
@@ -127,7 +127,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             One NaN in a batch of 4096 envs makes the loss NaN, then every weight of the network. Training
             ends there, often after hours, since the state that gives NaN is rare.
 
-            ## Mend
+            ## Fix
             Clamp divisors and the arguments of roots and logarithms.
 
             ```python fragment
@@ -155,7 +155,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             Trainers are tuned for rewards of about 1 per step. Larger rewards scale the value loss and the
             gradients, or are clipped, so that the best states look alike.
 
-            ## Mend
+            ## Fix
             Divide by the largest dense reward of one step.
 
             ```python fragment
@@ -184,7 +184,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             One NaN in a batch of 4096 envs makes the network's output NaN, then its weights, even if the
             reward is finite. Running means of a normaliser stay NaN forever.
 
-            ## Mend
+            ## Fix
             Clamp divisors, or leave the number out.
 
             ```python fragment

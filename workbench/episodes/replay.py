@@ -32,7 +32,7 @@ PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
 """Tolerances of a replay: if the position of a body, or the rotation of a body or joint, deviates by more
 from the recorded state, the replay restores that state."""
 
-Way = Literal["re-simulated", "corrected", "put there"]
+Way = Literal["re-simulated", "corrected", "restored"]
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def replay_to(
     with blamed("restore", opened.loaded, task):
         step = task.rescore()
     metres, radians = _distance(env, chosen, run.state(state))
-    way: Way = "put there" if why_not and state > 0 else "corrected" if corrected else "re-simulated"
+    way: Way = "restored" if why_not and state > 0 else "corrected" if corrected else "re-simulated"
     return step, ReplayResult(
         way,
         state,
@@ -237,7 +237,7 @@ def _distance(
 
 def replay_text(replay_result: ReplayResult) -> str:
     """Text on how the state was reached, and how close it is to the recording; follows the episode's name."""
-    if replay_result.way == "put there":
+    if replay_result.way == "restored":
         text = "the recorded state was restored; contacts and the task's own counters start over"
     elif replay_result.way == "corrected":
         text = (

@@ -94,7 +94,7 @@ class DrivePanel(PagePart[SessionView]):
                 )
                 sticks = pad_amounts(axes, buttons)
                 yaw = yaw_of(visitor.client.camera.wxyz)
-                self._session.happen(Driven(known, yaw, sticks if any(sticks) else ()))
+                self._session.dispatch(Driven(known, yaw, sticks if any(sticks) else ()))
 
 
 class DrivingSign(PagePart[SessionView]):

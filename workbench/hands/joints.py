@@ -16,7 +16,7 @@ FREE_DEGREES, FREE_METRES = 180.0, 2.0
 """A joint without limits has a slider from minus this value to plus this value."""
 
 
-def shown(joint: Joint, position: float) -> float:
+def display_value(joint: Joint, position: float) -> float:
     """A position in the unit of the page: degrees or metres, rounded."""
     return round(position, 4) if joint.prismatic else round(math.degrees(position), 2)
 
@@ -29,15 +29,15 @@ def position_of(joint: Joint, value: float) -> float:
 def slider_bounds(joint: Joint, position: float) -> tuple[float, float]:
     """Ends of the joint's slider in the page's unit: the joint's limits or, without limits, a range
     that contains the position."""
-    free, value = FREE_METRES if joint.prismatic else FREE_DEGREES, shown(joint, position)
-    low = shown(joint, joint.low) if math.isfinite(joint.low) else min(-free, value)
-    high = shown(joint, joint.high) if math.isfinite(joint.high) else max(free, value)
+    free, value = FREE_METRES if joint.prismatic else FREE_DEGREES, display_value(joint, position)
+    low = display_value(joint, joint.low) if math.isfinite(joint.low) else min(-free, value)
+    high = display_value(joint, joint.high) if math.isfinite(joint.high) else max(free, value)
     return low, max(high, low)
 
 
 def limits_text(joint: Joint) -> str:
     """The joint's limits with their unit."""
-    low, high = (shown(joint, end) for end in (joint.low, joint.high))
+    low, high = (display_value(joint, end) for end in (joint.low, joint.high))
     unit = " m" if joint.prismatic else "°"
     if math.isinf(low) and math.isinf(high):
         return f"no limits, {unit.strip()}"

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from workbench.envs.robots import Joint, RobotDescription
 from workbench.hands.commands import DragJoint, SetJoint, UseKeyframe, WriteQpos
 from workbench.hands.joints import (
+    display_value,
     keyframe_code,
     limits_text,
     qpos_code,
-    shown,
     slider_bounds,
 )
 from workbench.hands.link_poses import link_poses
@@ -131,7 +131,7 @@ class _RobotPart:
         for number, (joint, field) in enumerate(zip(robot.joints, self._sliders, strict=True)):
             position = shown_position(view, robot, number)
             off = past or (view.playing and joint.target is None)
-            field.show(shown(joint, position), off=off, bounds=slider_bounds(joint, position))
+            field.show(display_value(joint, position), off=off, bounds=slider_bounds(joint, position))
         keyframes = [
             Tool(one.name, UseKeyframe(robot=robot.name, name=one.name), off=past or view.playing)
             for one in robot.keyframes

@@ -224,12 +224,12 @@ class HandsPanel(PagePart[SessionView]):
                 of = self._required()
                 if why := why_not_moved(of.kind):
                     raise Refused(why)
-                self._session.happen(StartWanted(BodyPose(of.body, tuple(map(float, of.pose)))))
+                self._session.dispatch(StartWanted(BodyPose(of.body, tuple(map(float, of.pose)))))
             case ShowSpawn():
                 of = self._required()
                 if why := why_not_moved(of.kind):
                     raise Refused(why)
-                self._session.happen(SpawnAsked(of.body))
+                self._session.dispatch(SpawnAsked(of.body))
             case SetBodyPosition(of=axis, to=metres):
                 pose = self._required().pose.copy()
                 pose[XYZ.index(axis)] = metres
@@ -250,7 +250,7 @@ class HandsPanel(PagePart[SessionView]):
         """Put a body at a pose in the env's frame. Raises `Refused`."""
         view = self._session.view()
         envs = envs_of_move(view.of(Hands), of.env, 0 if view.task is None else view.task.num_envs)
-        self._session.happen(BodyMoved(of.body, envs, tuple(map(float, pose))))
+        self._session.dispatch(BodyMoved(of.body, envs, tuple(map(float, pose))))
 
     def follow(self, view: SessionView) -> None:
         """Let go if the page that drags has closed, if the pulled env was reset, or if a body that is being moved plays or
@@ -397,7 +397,7 @@ class HandsPanel(PagePart[SessionView]):
         self._drag = _Drag(drag.client, "pull", drag.of, drag.grabbed, drag.pose, target)
         x, y, z = map(float, drag.grabbed)
         a, b, c = map(float, target)
-        self._session.happen(BodyPulled(PullBody(drag.of.body, drag.of.env, (x, y, z), (a, b, c))))
+        self._session.dispatch(BodyPulled(PullBody(drag.of.body, drag.of.env, (x, y, z), (a, b, c))))
 
     def _turned(self, client: viser.ClientHandle | None, phase: str, pose: Floats) -> None:
         """Handle a drag of the handles."""
@@ -421,7 +421,7 @@ class HandsPanel(PagePart[SessionView]):
         if drag is None:
             return
         if drag.how == "pull":
-            self._session.happen(BodyPulled(PullBody()))
+            self._session.dispatch(BodyPulled(PullBody()))
         else:
             self._move(drag.of, drag.pose)
 
@@ -431,7 +431,7 @@ class HandsPanel(PagePart[SessionView]):
         drag, self._drag = self._drag, None
         self._ends_drag |= drag is not None
         if drag is not None and drag.how == "pull":
-            self._session.happen(BodyPulled(PullBody()))
+            self._session.dispatch(BodyPulled(PullBody()))
 
 
 def scope_choice(server: viser.ViserServer) -> Field:

@@ -211,7 +211,7 @@ class ReachPanel(PagePart[SessionView]):
         at = [*(pose[:3] - drag.offset).tolist(), *pose[3:].tolist()]
         if phase == "end":
             self._drag = None
-        self._session.happen(ArmDragged(arm, drag.env, tuple(map(float, at)), phase == "end"))
+        self._session.dispatch(ArmDragged(arm, drag.env, tuple(map(float, at)), phase == "end"))
 
     def follow(self) -> None:
         """Let go if the page that drags has closed, or if its handles are no longer shown: they report no end."""
@@ -225,7 +225,7 @@ class ReachPanel(PagePart[SessionView]):
         """Cancel the drag."""
         drag, self._drag = self._drag, None
         if drag is not None:
-            self._session.happen(ArmsReleased())
+            self._session.dispatch(ArmsReleased())
 
 
 def reached_text(answer: Reached) -> str:

@@ -142,13 +142,13 @@ class SearchJobs:
     """Performs the effects: one job at a time, at the priority of jobs that a person waits for. Used on the
     loop, except `close`."""
 
-    def __init__(self, process: Background, happen: Callable[[SearchEvent], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[SearchEvent], object]) -> None:
         """
         Args:
             process: the background process in which a job runs.
-            happen: handles the events of a job.
+            dispatch: handles the events of a job.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._jobs = Jobs(lambda: None, self._failed)
 
     def perform(self, effect: BeginSearch | EndSearch) -> None:
@@ -176,9 +176,9 @@ class SearchJobs:
                 )
 
             num_envs, met = await self._process.in_turns(job, ask)
-            self._happen(ResetTried(seed, num_envs, met))
+            self._dispatch(ResetTried(seed, num_envs, met))
             if met:
                 return
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(SearchFailed(str(failure), failure.problem))
+        self._dispatch(SearchFailed(str(failure), failure.problem))

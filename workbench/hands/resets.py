@@ -164,13 +164,13 @@ class ResetJobs:
     """Performs the effects: one job at a time, at the priority of jobs that a person waits for. Used on the
     loop, except `close`."""
 
-    def __init__(self, process: Background, happen: Callable[[ResetsEvent], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[ResetsEvent], object]) -> None:
         """
         Args:
             process: the background process in which a job runs.
-            happen: handles the events of a job.
+            dispatch: handles the events of a job.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._jobs = Jobs(lambda: None, self._failed)
 
     def perform(self, effect: ResetsEffect) -> None:
@@ -191,7 +191,7 @@ class ResetJobs:
                 await load_version(self._process, job, load)
                 return await self._process.ask(SampleReset(seed))
 
-            self._happen(ResetSampled(seed, await self._process.in_turns(job, ask)))
+            self._dispatch(ResetSampled(seed, await self._process.in_turns(job, ask)))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(SamplingFailed(str(failure), failure.problem))
+        self._dispatch(SamplingFailed(str(failure), failure.problem))

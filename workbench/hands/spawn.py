@@ -172,13 +172,13 @@ def _moved(box: SpawnBox, side: Side, to: float) -> Ranges:
 class SpawnJobs:
     """Performs the effects: one measurement at a time. Used on the loop, except `close`."""
 
-    def __init__(self, process: Background, happen: Callable[[SpawnEvent], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[SpawnEvent], object]) -> None:
         """
         Args:
             process: the background process, which resets the task.
-            happen: handles the resulting events.
+            dispatch: handles the resulting events.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._jobs = Jobs(lambda: None, self._failed)
         self._number = 0
 
@@ -203,9 +203,9 @@ class SpawnJobs:
         starts = await self._process.in_turns(job, ask)
         spawn = measure_spawn(starts, effect.task.geometry.body_names.index(effect.body))
         if spawn is None:
-            self._happen(SpawnFailed(effect.number, f"no env has {effect.body}", None))
+            self._dispatch(SpawnFailed(effect.number, f"no env has {effect.body}", None))
         else:
-            self._happen(SpawnMeasured(effect.number, spawn.seen, spawn.ranges))
+            self._dispatch(SpawnMeasured(effect.number, spawn.seen, spawn.ranges))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(SpawnFailed(self._number, str(failure), failure.problem))
+        self._dispatch(SpawnFailed(self._number, str(failure), failure.problem))

@@ -151,7 +151,7 @@ class SpawnPanel:
         if phase == "end":
             self._drag = None
         axis = AXES.index(side[0])
-        self._session.happen(SpawnDragged(side, float(position[axis] - drag.offset[axis])))
+        self._session.dispatch(SpawnDragged(side, float(position[axis] - drag.offset[axis])))
 
     def follow(self) -> None:
         """Let go if the page that drags has closed, or if the handle is hidden: neither reports an end."""

@@ -60,7 +60,7 @@ Beginning = BodyPose | SpawnRange | RobotQpos
 
 @dataclass(frozen=True)
 class StartEdit:
-    """A change of the file that makes episodes begin elsewhere. Also the view of this feature."""
+    """A change of the file that changes where episodes start. Also the view of this feature."""
 
     stage: Literal["none", "planning", "planned", "refused", "written", "checked", "mismatch", "undone"] = (
         "none"

@@ -51,13 +51,13 @@ QPOS_TOLERANCE = 1e-3
 class StartJobs:
     """Performs the effects: one plan or check at a time. Used on the loop, except `close`."""
 
-    def __init__(self, process: Background, happen: Callable[[StartEvent], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[StartEvent], object]) -> None:
         """
         Args:
             process: the background process, which resets the task with the old and the new text.
-            happen: handles the resulting events.
+            dispatch: handles the resulting events.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._asked: PlanStart | CheckStart | None = None
         self._jobs = Jobs(lambda: None, self._failed)
         self._aside = BlockingPool("start-edits")
@@ -83,9 +83,9 @@ class StartJobs:
             edit = await self._verified(job, effect)
         except RefusedEdit as refused:
             snippet = refused.snippet or _lines_to_copy(effect.wanted)
-            self._happen(StartRefused(effect.number, refused.reason, snippet))
+            self._dispatch(StartRefused(effect.number, refused.reason, snippet))
         else:
-            self._happen(StartPlanned(effect.number, edit))
+            self._dispatch(StartPlanned(effect.number, edit))
 
     async def _verified(self, job: Job, effect: PlanStart) -> SourceEdit:
         """The planned change, after a run of the new text has confirmed it. Raises RefusedEdit."""
@@ -118,11 +118,11 @@ class StartJobs:
             raise RefusedEdit(f"a run of the changed file shows: {why}")
         notes = list(edit.notes)
         if caused := [name for name in others if name not in unseeded]:
-            notes.append(f"{', '.join(caused)} will begin elsewhere too.")
+            notes.append(f"The start of {', '.join(caused)} changes too.")
         if unseeded:
             notes.append(
-                f"At every run, with and without this change: {', '.join(unseeded)} begins elsewhere, because the task does "
-                "not draw it from the seed."
+                f"The start of {', '.join(unseeded)} differs from run to run, with and without this change: the task does not "
+                "draw it from the seed."
             )
         return replace(edit, notes=tuple(notes))
 
@@ -135,7 +135,7 @@ class StartJobs:
         if wanted.of in names:
             starts = await self._read(job, effect.load, effect.seeds, task.source)
             why = difference(starts, task, wanted)
-        self._happen(StartChecked(effect.number, why))
+        self._dispatch(StartChecked(effect.number, why))
 
     async def _read(
         self, job: Job, load: Load, seeds: tuple[int, ...], texts: Mapping[str, str]
@@ -154,7 +154,7 @@ class StartJobs:
         try:
             await self._aside.run(partial(change, wanted.edit))
         except RefusedEdit as refused:
-            self._happen(StartFileFailed(wanted.number, refused.reason))
+            self._dispatch(StartFileFailed(wanted.number, refused.reason))
 
     def _failed(self, failure: JobFailed) -> None:
         asked = self._asked
@@ -162,9 +162,9 @@ class StartJobs:
         problem = failure.problem
         why = f"{failure}: {problem.message}" if problem is not None else str(failure)
         if isinstance(asked, PlanStart):
-            self._happen(StartRefused(asked.number, why, _lines_to_copy(asked.wanted)))
+            self._dispatch(StartRefused(asked.number, why, _lines_to_copy(asked.wanted)))
         else:
-            self._happen(StartChecked(asked.number, f"It could not be checked: {why}"))
+            self._dispatch(StartChecked(asked.number, f"It could not be checked: {why}"))
 
 
 def _planned(
@@ -230,7 +230,7 @@ def _unseeded(
     wanted: Beginning,
     others: Sequence[str],
 ) -> list[str]:
-    """What begins elsewhere in two runs of the same text with the same seeds: those of the bodies `others`, or the robot
+    """Names whose start differs between two runs of the same source with the same seeds: bodies of `others`, or the robot
     whose joints are wanted."""
     if isinstance(wanted, RobotQpos):
         apart = np.abs(_qpos_of(again, task, wanted) - _qpos_of(before, task, wanted)).max()
@@ -245,13 +245,13 @@ def _poses_of(starts: Sequence[EpisodeStart], row: int) -> Poses:
 
 
 def _moved(
-    before: Sequence[EpisodeStart], after: Sequence[EpisodeStart], task: TaskDescription, but: str
+    before: Sequence[EpisodeStart], after: Sequence[EpisodeStart], task: TaskDescription, exclude: str
 ) -> list[str]:
-    """Names of the bodies, except `but`, that begin elsewhere with the same seeds."""
+    """Names of the bodies, except `exclude`, whose start differs with the same seeds."""
     apart = np.stack([new.poses - old.poses for old, new in zip(before, after, strict=True)])
     moved = np.nanmax(np.abs(apart), axis=(0, 1, 3), initial=0.0) > POSITION_TOLERANCE_METRES
     names = task.geometry.body_names
-    return [name for name, is_moved in zip(names, moved, strict=True) if is_moved and name != but]
+    return [name for name, is_moved in zip(names, moved, strict=True) if is_moved and name != exclude]
 
 
 def difference(starts: Sequence[EpisodeStart], task: TaskDescription, wanted: Beginning) -> str:

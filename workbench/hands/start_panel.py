@@ -10,7 +10,7 @@ from workbench.hands.start_edit import IN_FILE, StartEdit
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool
 
-MOODS = {"checked": "good", "refused": "warn", "mismatch": "bad"}
+TONES = {"checked": "good", "refused": "warn", "mismatch": "bad"}
 
 
 def start_edit_html(edit: StartEdit) -> str:
@@ -22,7 +22,7 @@ def start_edit_html(edit: StartEdit) -> str:
     return render(
         "camera_writing",
         message=edit.message,
-        mood=MOODS.get(edit.stage, "plain"),
+        tone=TONES.get(edit.stage, "plain"),
         about="",
         picture="",
         drawing=None,

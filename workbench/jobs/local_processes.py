@@ -32,7 +32,7 @@ class Processes:
     """Runs the work in spawned processes, each on its share of the cores."""
 
     @property
-    def elsewhere(self) -> bool:
+    def is_remote(self) -> bool:
         return False
 
     def __init__(self, workers: int, on_death: Callable[[str], None] = lambda text: None) -> None:

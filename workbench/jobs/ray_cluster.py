@@ -62,7 +62,7 @@ class Cluster:
     """Called with a sentence when a worker has died and the job continues; see `Listener`."""
 
     @property
-    def elsewhere(self) -> bool:
+    def is_remote(self) -> bool:
         return True
 
     def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
@@ -281,14 +281,14 @@ class MessageBroker:
     """Actor that passes messages between the workers and the dealing process. It keeps messages until they are taken."""
 
     def __init__(self) -> None:
-        self._said: deque[tuple[int, bytes]] = deque()
+        self._messages: deque[tuple[int, bytes]] = deque()
         self._came = asyncio.Event()
         self._answers: dict[int, asyncio.Future[Chunk | None]] = {}
         self._limit = NO_LIMIT
 
     async def put(self, worker: int, messages: list[bytes]) -> int:
         """Store messages of a worker; returns the scheduler's limit (`ItemQueue.limit`)."""
-        self._said.extend((worker, message) for message in messages)
+        self._messages.extend((worker, message) for message in messages)
         self._came.set()
         return self._limit
 
@@ -306,14 +306,14 @@ class MessageBroker:
 
     async def take(self, seconds: float) -> list[tuple[int, bytes]]:
         """New messages; waits up to `seconds` for the first one."""
-        if not self._said and seconds:
+        if not self._messages and seconds:
             self._came.clear()
             try:
                 await asyncio.wait_for(self._came.wait(), seconds)
             except asyncio.TimeoutError:
                 return []
-        messages = list(self._said)
-        self._said.clear()
+        messages = list(self._messages)
+        self._messages.clear()
         return messages
 
     async def set_limit(self, limit: int) -> None:
@@ -390,7 +390,7 @@ class _BrokerQueue(WorkerQueue):
     def __init__(self, broker: Any, worker: int, origin: Mapping[str, str]) -> None:
         self._broker, self._worker, self.origin = broker, worker, origin
         self._waiting: list[bytes] = []
-        self._said = 0.0
+        self._last_sent = 0.0
         self._limit: int = NO_LIMIT
         self._put: Any = None
         """Ray reference to the result of the last `MessageBroker.put` call: the limit at that time."""
@@ -405,7 +405,7 @@ class _BrokerQueue(WorkerQueue):
     def limit(self) -> int:
         import ray
 
-        if time.monotonic() - self._said > _SEND_SECONDS:
+        if time.monotonic() - self._last_sent > _SEND_SECONDS:
             self._send()
         if self._put is not None and ray.wait([self._put], timeout=0)[0]:
             self._limit, self._put = int(ray.get(self._put)), None
@@ -413,7 +413,7 @@ class _BrokerQueue(WorkerQueue):
 
     def send(self, message: Message) -> None:
         self._waiting.append(pack_message(message))
-        if time.monotonic() - self._said > _SEND_SECONDS:
+        if time.monotonic() - self._last_sent > _SEND_SECONDS:
             self._send()
 
     def flush(self) -> None:
@@ -427,4 +427,4 @@ class _BrokerQueue(WorkerQueue):
     def _send(self) -> None:
         messages, self._waiting = self._waiting, []
         self._put = self._broker.put.remote(self._worker, messages)
-        self._said = time.monotonic()
+        self._last_sent = time.monotonic()

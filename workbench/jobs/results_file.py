@@ -172,8 +172,8 @@ class Kept:
     """Returns whether the files that a result names still exist. An item without its files runs again."""
 
     @property
-    def elsewhere(self) -> bool:
-        return self.executor.elsewhere
+    def is_remote(self) -> bool:
+        return self.executor.is_remote
 
     def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
         scheduler.take_part(self.shard)

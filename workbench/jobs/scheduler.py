@@ -420,7 +420,7 @@ class Executor(Protocol):
     """Does the work of a job."""
 
     @property
-    def elsewhere(self) -> bool:
+    def is_remote(self) -> bool:
         """Whether workers may run on other machines."""
         ...
 
@@ -439,7 +439,7 @@ class ThisProcess:
     """Runs the work in this process; exceptions of `Work.run` other than TaskError pass through."""
 
     @property
-    def elsewhere(self) -> bool:
+    def is_remote(self) -> bool:
         return False
 
     def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:

@@ -69,8 +69,8 @@ def apply(known: KnownPolicies, event: object, run: Run) -> tuple[KnownPolicies,
 class PolicySearch:
     """Performs `ListPolicies`. Used on the loop, except `close`."""
 
-    def __init__(self, happen: Callable[[PoliciesListed], object]) -> None:
-        self._happen = happen
+    def __init__(self, dispatch: Callable[[PoliciesListed], object]) -> None:
+        self._dispatch = dispatch
         self._here = Path.cwd()
         self._disk = BlockingPool("policies")
         self._jobs = Jobs(lambda: None, lambda failure: None)
@@ -89,7 +89,7 @@ class PolicySearch:
     async def _list(self, wanted: Wanted, job: Job) -> None:
         await self._disk.run(partial(_keep, self._here, wanted))
         while True:
-            self._happen(PoliciesListed(await self._disk.run(partial(_find, self._here, wanted))))
+            self._dispatch(PoliciesListed(await self._disk.run(partial(_find, self._here, wanted))))
             await asyncio.sleep(LIST_SECONDS)
 
 

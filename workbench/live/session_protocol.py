@@ -26,7 +26,7 @@ class LiveSession(Protocol):
         """Carry out a command. Raises `Refused` if the command makes no sense now."""
         ...
 
-    def happen(self, event: Any) -> None:
+    def dispatch(self, event: Any) -> None:
         """Handle an event of `live.events` or of a feature. Raises `Refused` for a command that makes no sense now."""
         ...
 

@@ -159,7 +159,7 @@ def do_record(
     run = run or uuid.uuid4().hex
     needed = [needed_by(what.task, what.actions, what.options.imports) for what in wanted]
     folders = [what.out.absolute() for what in wanted]
-    mark = f".{run}" if executor.elsewhere else ""
+    mark = f".{run}" if executor.is_remote else ""
     work = Work(
         run_items,
         RecordSetup(tuple(wanted), tuple(map(os.fsencode, folders)), stride, run, mark),

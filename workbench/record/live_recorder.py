@@ -36,15 +36,15 @@ class LiveRecorder:
     def __init__(
         self,
         folder: Path,
-        happen: Callable[[RecordEvent], object],
+        dispatch: Callable[[RecordEvent], object],
         on_recovered: Callable[[str], None] = lambda message: None,
     ) -> None:
         """
         Args:
-            happen: called on the loop with the events of the recording.
+            dispatch: called on the loop with the events of the recording.
             on_recovered: called on another thread with a message about unfinished episodes of an earlier session.
         """
-        self._folder, self._happen, self._on_recovered = folder, happen, on_recovered
+        self._folder, self._dispatch, self._on_recovered = folder, dispatch, on_recovered
         self._number = 0
         self._gatherer: EpisodeGatherer | None = None
         """Takes the steps, on the thread of `_aside`."""
@@ -81,7 +81,7 @@ class LiveRecorder:
     # --- on other threads than the loop's --------------------------------------------------------------
 
     def _post(self, event: RecordEvent) -> None:
-        post(partial(self._happen, event))
+        post(partial(self._dispatch, event))
 
     def _take(self, gatherer: EpisodeGatherer, number: int, what: TakeStep) -> None:
         problem = None

@@ -62,15 +62,15 @@ class PastSaver:
         folder: Path,
         finisher: EpisodeFinisher,
         process: Background,
-        happen: Callable[[SaveEvent | EpisodeEnded], object],
+        dispatch: Callable[[SaveEvent | EpisodeEnded], object],
     ) -> None:
         """
         Args:
             finisher: makes the files.
             process: the process that renders moments again.
-            happen: called on the loop with the events of a job.
+            dispatch: called on the loop with the events of a job.
         """
-        self._folder, self._finisher, self._process, self._happen = folder, finisher, process, happen
+        self._folder, self._finisher, self._process, self._dispatch = folder, finisher, process, dispatch
         self._job = 0
         """Number of the running job."""
         self._jobs = Jobs(self._progressed, self._failed)
@@ -97,7 +97,7 @@ class PastSaver:
 
     def _progressed(self) -> None:
         if (progress := self._jobs.progress) is not None:
-            self._happen(SaveProgressed(self._job, progress))
+            self._dispatch(SaveProgressed(self._job, progress))
 
     # --- the job -------------------------------------------------------------------------------------
 
@@ -140,7 +140,7 @@ class PastSaver:
         def finish() -> list[str]:
             made = []
             for episode in writers.values():
-                post(partial(self._happen, EpisodeEnded(live=False)))
+                post(partial(self._dispatch, EpisodeEnded(live=False)))
                 made.append(self._finisher.finish(episode))
             return [result for future in made if isinstance(result := future.result(), str)]
 
@@ -169,7 +169,7 @@ class PastSaver:
             + _lost_seed_text(lost, len(writers))
             + _earlier_text(earlier, len(writers))
         )
-        self._happen(EpisodesSaved(self._job, message))
+        self._dispatch(EpisodesSaved(self._job, message))
 
     def _begun(
         self, what: SaveRequest, placed: tuple[PlaceCamera, ...], episode: PastEpisode, seed: int
@@ -202,7 +202,7 @@ class PastSaver:
         if problem is not None:
             where = "" if problem.line is None else f" (line {problem.line})"
             why = f"The episode could not be rendered again: {problem.message}{where}"
-        self._happen(SaveFailed(self._job, why))
+        self._dispatch(SaveFailed(self._job, why))
 
 
 def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:

@@ -99,7 +99,7 @@ class RescoreSetup:
     """Recordings by number; the numbers of chunk k begin at ``k * chunk``."""
     chunk: int
     use_env_states: bool = False
-    elsewhere: bool = False
+    is_remote: bool = False
     """Whether workers on other machines read the recordings from a shared folder, because the recordings are
     too large to send."""
 
@@ -167,7 +167,7 @@ def rescore_recordings(
         sorted(setup.items), take, take_update, chunk=setup.chunk, tries=_MAX_CHUNK_STARTS, on_failure=failed
     )
     folders, files = _needed(setup)
-    if executor.elsewhere:
+    if executor.is_remote:
         setup, recordings = _travelling(setup)
         files = [*files, *recordings]
     work = Work(
@@ -211,7 +211,7 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
         if (file := of.source().path.with_suffix(suffix)).is_file()
     }
     if sum(file.stat().st_size for file in files) > MAX_BYTES // 2:
-        return replace(setup, elsewhere=True), []
+        return replace(setup, is_remote=True), []
     items = {number: replace(of, travels=of.source().path.resolve()) for number, of in setup.items.items()}
     return replace(setup, items=items), sorted(files)
 
@@ -300,7 +300,7 @@ class _Rescorer:
         """Source of a recording on this machine, with `number` as its id."""
         of = self.setup.items[number]
         path = of.travels or of.source().path
-        if self.setup.elsewhere and not path.parent.is_dir():
+        if self.setup.is_remote and not path.parent.is_dir():
             raise FileNotFoundError(
                 f"{platform.node()} does not see the recordings in {path.parent}, which are too large to send: put them "
                 "into a folder that all machines of the cluster share"

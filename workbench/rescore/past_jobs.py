@@ -31,13 +31,13 @@ class PastRescorer:
     hangs, the process is killed.
     """
 
-    def __init__(self, process: Background, happen: Callable[[RescoringUpdate], object]) -> None:
+    def __init__(self, process: Background, dispatch: Callable[[RescoringUpdate], object]) -> None:
         """
         Args:
             process: the background process; other jobs there have priority.
-            happen: called on the loop with the events of a job.
+            dispatch: called on the loop with the events of a job.
         """
-        self._process, self._happen = process, happen
+        self._process, self._dispatch = process, dispatch
         self._jobs = Jobs(lambda: None, self._failed)
         self._update = RescoringUpdate(0, RescoreView())
         """State and results of the running job, or of the last one."""
@@ -65,7 +65,7 @@ class PastRescorer:
     def _send_view(self, **values: Any) -> None:
         """Update these fields of the view, and send it."""
         self._update = replace(self._update, view=replace(self._update.view, **values))
-        self._happen(self._update)
+        self._dispatch(self._update)
 
     # --- the job -------------------------------------------------------------------------------------
 

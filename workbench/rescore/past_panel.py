@@ -106,7 +106,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
     def _show(self, verdict: Verdict[PastRun]) -> None:
         env, at = _place(verdict)
         if at >= self._session.view().timeline.first:
-            self._session.happen(MomentShown(at, env))
+            self._session.dispatch(MomentShown(at, env))
         else:
             self._session.change(selected_env=env)
 

@@ -179,7 +179,7 @@ class Rescorer:
     @on_loop
     def do(self, command: Command) -> None:
         """Carry out `StopRescoring`. Raises `Refused`."""
-        self._happen(Asked(command))
+        self._dispatch(Asked(command))
 
     @on_loop
     def start(
@@ -209,7 +209,7 @@ class Rescorer:
 
     # --- on the loop ---------------------------------------------------------------------------------
 
-    def _happen(self, event: Asked | RescoringUpdate) -> None:
+    def _dispatch(self, event: Asked | RescoringUpdate) -> None:
         self._rescoring, effects = apply_to_job(self._rescoring, event)
         if effects:
             self._jobs.stop()
@@ -218,7 +218,7 @@ class Rescorer:
         """Update these fields of the view, add verdicts, and send the view."""
         known = (*self.view.verdicts, *verdicts)
         view = replace(self.view, verdicts=known, done=len(known), **values)
-        self._happen(RescoringUpdate(self._rescoring.job, view))
+        self._dispatch(RescoringUpdate(self._rescoring.job, view))
 
     def _failed(self, failure: JobFailed) -> None:
         self._send_view(state="failed", why=str(failure), problem=failure.problem)

@@ -136,7 +136,7 @@ def apply_to_job(rescoring: Rescoring, event: object) -> Change:
         case Asked(command=StopRescoring()):
             if not rescoring.running:
                 raise Refused("Nothing is being rescored.")
-            return _stop(rescoring, StoppedBy.HAND)
+            return _stop(rescoring, StoppedBy.USER)
         case RescoringUpdate(job=rescoring.job, view=view) if rescoring.running:
             return rescoring.shows(view), []
     return rescoring, []

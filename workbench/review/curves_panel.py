@@ -223,10 +223,10 @@ def compared(
     Args:
         beside: (rows, state) of each recording that has a column.
     """
-    moods = {row.name: row.mood for row in rows}
+    tones = {row.name: row.tone for row in rows}
     for others, _ in beside:
         for row in others:
-            moods.setdefault(row.name, "")
+            tones.setdefault(row.name, "")
     columns = [
         {row.name: known(row.whole or row.selected, state) for row in others} for others, state in beside
     ]
@@ -234,12 +234,12 @@ def compared(
     return [
         {
             "name": name,
-            "mood": mood,
+            "tone": tone,
             "whole": name in hints,
             "hint": hints.get(name, ""),
             "values": [column.get(name, "—") for column in columns],
         }
-        for name, mood in moods.items()
+        for name, tone in tones.items()
     ]
 
 

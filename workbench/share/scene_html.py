@@ -74,9 +74,9 @@ def seconds_a_step(episode: Episode) -> float:
 def _caption(episode: Episode) -> str:
     info = episode.info
     about = f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
-    ended, mood = outcome_text(episode)
+    ended, tone = outcome_text(episode)
     dt = seconds_a_step(episode)
-    return render("scene_caption", about=about, ended=ended if mood else "", dt=dt, steps=episode.length)
+    return render("scene_caption", about=about, ended=ended if tone else "", dt=dt, steps=episode.length)
 
 
 def _recorded(

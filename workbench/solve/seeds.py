@@ -170,13 +170,13 @@ class _Setup:
 class SeedsJobs:
     """Performs the effects: one job at a time. Used on the loop, except `close`."""
 
-    def __init__(self, recordings: Path, happen: Callable[[SeedsEvent], object]) -> None:
+    def __init__(self, recordings: Path, dispatch: Callable[[SeedsEvent], object]) -> None:
         """
         Args:
             recordings: the folder for the episodes.
-            happen: handles the resulting events.
+            dispatch: handles the resulting events.
         """
-        self._recordings, self._happen = recordings.absolute(), happen
+        self._recordings, self._dispatch = recordings.absolute(), dispatch
         self._jobs = Jobs(lambda: None, self._failed)
         self._aside = BlockingPool("solve-seeds")
 
@@ -196,7 +196,7 @@ class SeedsJobs:
 
     async def _solve(self, job: Job, setup: _Setup) -> None:
         await self._aside.run(lambda: self._run(job, setup))
-        self._happen(SeedsDone())
+        self._dispatch(SeedsDone())
 
     def _run(self, job: Job, setup: _Setup) -> None:
         """Run the job on its own thread."""
@@ -205,7 +205,7 @@ class SeedsJobs:
         work = Work(_run, setup, SolveReport, SeedsUpdate, "that solves")
 
         def send_update(update: SeedsUpdate) -> None:
-            post(lambda: job.stopped or self._happen(update))
+            post(lambda: job.stopped or self._dispatch(update))
 
         deal: Scheduler[SolveReport, SeedsUpdate] = Scheduler(
             range(1),
@@ -223,7 +223,7 @@ class SeedsJobs:
             raise JobFailed(str(error)) from error
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(SeedsFailed(str(failure), failure.problem))
+        self._dispatch(SeedsFailed(str(failure), failure.problem))
 
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:

@@ -291,12 +291,12 @@ class PlanJobs:
     is started with the first plan and ends some time after the last one.
     """
 
-    def __init__(self, happen: Callable[[SolverEvent], object]) -> None:
+    def __init__(self, dispatch: Callable[[SolverEvent], object]) -> None:
         """
         Args:
-            happen: handles the resulting events.
+            dispatch: handles the resulting events.
         """
-        self._happen = happen
+        self._dispatch = dispatch
         self._process = Background(_NICENESS)
         self._jobs = Jobs(self._on_progress, self._failed)
 
@@ -304,7 +304,7 @@ class PlanJobs:
         match effect:
             case BeginPlan():
                 if not self._process.has_loaded(effect.load):
-                    self._happen(RolloutsStart())
+                    self._dispatch(RolloutsStart())
                 self._jobs.start("planning", lambda job: self._plan(job, effect))
             case EndPlan():
                 self._jobs.stop()
@@ -325,14 +325,14 @@ class PlanJobs:
         planned = await self._process.in_turns(job, ask)
         seconds = time.monotonic() - began
         made = sum(len(one.returns) * one.horizon for one in planned.envs) * what.options.rounds
-        self._happen(PlanMade(what.wanted, planned.envs, made / max(seconds, 1e-6)))
+        self._dispatch(PlanMade(what.wanted, planned.envs, made / max(seconds, 1e-6)))
 
     def _on_progress(self) -> None:
         if (progress := self._jobs.progress) is not None:
-            self._happen(PlanActivity(progress.what))
+            self._dispatch(PlanActivity(progress.what))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(PlanFailed(str(failure), failure.problem))
+        self._dispatch(PlanFailed(str(failure), failure.problem))
 
 
 def _curves(episode: RunningEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

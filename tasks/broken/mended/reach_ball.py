@@ -1,4 +1,4 @@
-"""Reach a ball that floats somewhere over the table: the mended version of `../reach_ball.py`.
+"""Reach a ball that floats somewhere over the table: the fixed version of `../reach_ball.py`.
 
 The reward measures what `evaluate` asks for: the distance in all three directions. `workbench solve` solves every
 seed of it, and finds no other state that pays as much as success.

@@ -97,7 +97,7 @@ def test_an_upload_left_by_a_dead_worker_is_replaced(tmp_path: Path) -> None:
     first = record(what, run=run)
 
     class Again:
-        elsewhere = False
+        is_remote = False
 
         def run(self, work: Work, scheduler: Scheduler) -> None:
             # As if the first worker had died before it reported the first episode.

@@ -136,7 +136,7 @@ def test_rows_equal_the_reference_for_each_env_and_in_the_past(
         }
         assert {at: what for at, what in found.items() if what} == flags[env]
     for place in (None, base + len(seen) // 2):  # now, and as it was
-        session.happen(MomentShown(place))
+        session.dispatch(MomentShown(place))
         at = session.view().step_serial - base
         now, before = seen[at]
         rows = session.env_rows()
@@ -156,7 +156,7 @@ def test_rows_equal_the_reference_for_each_env_and_in_the_past(
         if place is None:
             assert (rows.ended.tolist(), rows.succeeded.tolist()) == (ended, succeeded)
             assert rows.failed.tolist() == failed
-    session.happen(MomentShown(None))
+    session.dispatch(MomentShown(None))
 
 
 def test_an_env_restored_from_an_unknown_moment_has_no_return(

@@ -40,9 +40,9 @@ def pictured(fake: FakeWorkerSession) -> list[int]:
     session, found = fake.session, []
     session.change(cameras=(EYE,))
     for serial in range(fake.view.timeline.first, fake.view.timeline.last):
-        session.happen(MomentShown(serial))
+        session.dispatch(MomentShown(serial))
         found += [serial] if fake.view.pictures else []
-    session.happen(MomentShown(None))
+    session.dispatch(MomentShown(None))
     return found
 
 
@@ -78,11 +78,11 @@ def test_snapshot_parts_are_kept_and_counted_while_a_moment_needs_them(tmp_path:
         fake.step(part_keys=(2, 3), new_parts={3: bytes(100)})
         second = fake.view.timeline.used - with_both - 100
         fake.step(part_keys=(2, 99))
-        fake.session.happen(MomentShown(2))
+        fake.session.dispatch(MomentShown(2))
         assert not fake.view.timeline.can_continue, "a part never arrived"
-        fake.session.happen(MomentShown(1))
+        fake.session.dispatch(MomentShown(1))
         assert fake.view.timeline.can_continue
-        fake.session.happen(MomentShown(None))
+        fake.session.dispatch(MomentShown(None))
         fake.step(part_keys=(2, 3))
         fake.step(100)
         timeline = fake.view.timeline
@@ -263,7 +263,7 @@ def test_an_episode_has_the_steps_and_numbers_of_its_own_env_and_of_where_it_wen
     assert episodes(fake, 1, 1, HEIGHT, REWARD)[1] == ([1, 2], [-31, -41], [31, 41])
     assert episodes(fake, 0, 5, REWARD) == [([1, 2], [31, 60]), ([1, 2], [10, 20])]
     assert episodes(fake, 1, 0, REWARD, last=8) == [([1], [51])], "the view is older than the history"
-    fake.session.happen(MomentShown(4))
+    fake.session.dispatch(MomentShown(4))
     assert episodes(fake, 1, 5, REWARD) == own[1:], "the whole shown episode, and those before it"
     assert episodes(fake, 1, 0, REWARD, last=4) == [([1], [31])]
 

@@ -49,13 +49,13 @@ class Form:
         task = replace(view.task, made=MADE, device="cpu, pictures on llvmpipe")
         self.view: SessionView = replace(view, task=task, options=TaskOptions(4))
         monkeypatch.setattr(session, "view", lambda: self.view)
-        monkeypatch.setattr(session, "happen", self._happens)
+        monkeypatch.setattr(session, "dispatch", self._dispatched)
         self.panel = EnvOptionsPanel(panels.server, session)
         self.parts = Parts([self.panel])
         panels.visitors.do = self.parts.do
         self.draw()
 
-    def _happens(self, event: object) -> None:
+    def _dispatched(self, event: object) -> None:
         assert isinstance(event, OptionsApplied)
         self.applied.append(event.options)
 

@@ -50,8 +50,8 @@ def test_right_after_a_reset_there_is_no_reward_but_a_rescored_one_is_shown() ->
 
 def test_rows_are_of_the_selected_env_and_few() -> None:
     entries: dict[str, Any] = {"success": [True, False, False, False], "fail": [False, True, False, False]}
-    assert [rows_of(env, **entries)["success"].mood for env in range(2)] == ["good", ""]
-    assert [rows_of(env, **entries)["fail"].mood for env in range(2)] == ["", "bad"]
+    assert [rows_of(env, **entries)["success"].tone for env in range(2)] == ["good", ""]
+    assert [rows_of(env, **entries)["fail"].tone for env in range(2)] == ["", "bad"]
     rows = rows_of(2, far=np.array([0, 0, 12345.0, 0]), at=np.arange(24.0).reshape(4, 6), count=[1, 2, 3, 6])
     assert [rows[name].selected for name in ("far", "at", "count")] == [
         *("1.23e+04", "[12.000, 13.000, 14.000, 15.000, … 6]", "3")

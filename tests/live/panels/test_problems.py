@@ -241,7 +241,7 @@ def test_the_reason_stays_visible_while_a_worker_starts(live: Live) -> None:
 
 
 def test_an_interrupt_is_not_shown_as_a_failure(live: Live) -> None:
-    live.show(failed(problem=replace(problem("Interrupted: stopped by hand"), interrupted=True)))
+    live.show(failed(problem=replace(problem("Interrupted: stopped by the user"), interrupted=True)))
     assert "interrupted in evaluate" in banner(live) and "failed" not in banner(live)
 
 

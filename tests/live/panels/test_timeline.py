@@ -115,10 +115,10 @@ def test_the_slider_ends_follow_a_moment_beyond_them_at_once_and_others_rarely(l
     assert lived.ends() == (-2, 0, 0)
     lived.session.do(Step())
     wait_until(lived.session, lambda view: view.timeline.last == 8, "a step")
-    lived.session.happen(MomentShown(6))
+    lived.session.dispatch(MomentShown(6))
     lived.page.redraw()
     assert lived.ends() == (-2, 0, -1), "a moment within them does not disturb a drag of the slider"
-    lived.session.happen(MomentShown(2))
+    lived.session.dispatch(MomentShown(2))
     lived.page.redraw()
     assert lived.ends() == (-7, -3, -5), "the last episode"
     lived.draw()

@@ -74,7 +74,7 @@ def session(risky_session: Session, file: Path) -> Iterator[Session]:
     session = risky_session
     session.do(PauseRun())
     steps = session.view().step_serial
-    session.happen(EnvsReset())
+    session.dispatch(EnvsReset())
     wait_until(session, lambda v: v.step_serial > steps and not v.step.elapsed_steps.any(), "the reset")
     step(session, 3)
     wait_until(session, lambda v: v.problem is None and v.busy is None, "calm")
@@ -119,7 +119,7 @@ def test_an_infinite_loop_in_a_step_is_reported_and_can_be_interrupted_with_its_
 
 def test_interrupting_a_loop_in_a_replay_leaves_the_batch_where_it_was(session: Session, file: Path) -> None:
     before, worker = step(session, 3), session.worker_pid
-    session.happen(MomentShown(before.timeline.last - 2))
+    session.dispatch(MomentShown(before.timeline.last - 2))
     provoke(file, "evaluate", "loop")
     session.do(ContinueFromHere(scope="all"))
     wait_until(session, lambda v: v.busy is not None, "busy")
@@ -134,7 +134,7 @@ def test_interrupting_a_loop_in_a_replay_leaves_the_batch_where_it_was(session: 
         view.step.elapsed_steps.tolist() == [7, 7] and view.problem is None and session.worker_pid == worker
     )
     # The same request can be repeated and reaches the moment.
-    session.happen(MomentShown(before.timeline.last - 2))
+    session.dispatch(MomentShown(before.timeline.last - 2))
     shown, last = session.view().step.poses, view.timeline.last
     session.do(ContinueFromHere(scope="all"))
     view = wait_until(session, lambda v: v.timeline.last > last, "the going back")
@@ -279,7 +279,7 @@ def test_a_version_that_kills_its_process_on_import_costs_one_worker(session: Se
 
 def test_a_recording_loses_only_the_step_in_progress(session: Session, file: Path) -> None:
     written = another_version(session, file).of(RecordingStatus).episodes_written
-    session.happen(RecordingWanted((1,)))
+    session.dispatch(RecordingWanted((1,)))
     for count in (1, 2, 3, 4, 5):
         session.do(Step())
         wait_until(session, lambda v, n=count: v.of(RecordingStatus).steps == n, f"recorded step {count}")
@@ -425,7 +425,7 @@ def test_a_task_that_changes_the_working_directory_is_still_reloaded_and_recorde
         wait_until(
             session, lambda v: v.task_serial > before.task_serial and v.problem is None, "the new version"
         )
-        session.happen(RecordingWanted())
+        session.dispatch(RecordingWanted())
         wait_until(session, lambda v: v.of(RecordingStatus).active, "the recording")
         session.do(Step())
         wait_until(session, lambda v: v.of(RecordingStatus).steps == 1, "a recorded step")

@@ -47,7 +47,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         (cube,) = (number for number, name in view.task.segmentation.items() if name == "cube")
         column = view.task.geometry.body_names.index("cube")
         session.change(cameras=(CameraRequest(CAMERA[1], "sensor", ("rgb", "segmentation")),))
-        session.happen(PagesCounted(1))
+        session.dispatch(PagesCounted(1))
 
         def shows_cube(view: SessionView) -> bool:
             segmentation = view.pictures[CAMERA].segmentation
@@ -68,7 +68,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         # A past moment, and continuing from it.
         session.change(selected_env=1)
         past = session.view().timeline.first
-        session.happen(MomentShown(past))
+        session.dispatch(MomentShown(past))
         draw_past(session)
         view = wait_until(session, lambda v: v.timeline.shown == past and drawn(v, 1), "a picture of then")
         assert not shows_cube(view)

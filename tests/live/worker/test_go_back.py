@@ -161,7 +161,7 @@ def test_an_interrupt_ends_a_replay_and_another_failure_does_not(
     assert lived.opened.env.env.elapsed_steps.tolist() == [T + later for later in LATER], (
         "the moment was restored"
     )
-    fails_in_the_fifth_step(Interrupted("stopped by hand"))
+    fails_in_the_fifth_step(Interrupted("stopped by the user"))
     with pytest.raises(TaskError) as ended:
         lived.back(T, dict.fromkeys(range(N), 0))
     assert isinstance(ended.value.__cause__, Interrupted) and len(lived.told) == 4

@@ -79,7 +79,7 @@ def test_an_end_of_the_program_is_a_failure_and_an_interrupt_drops_the_steps_tha
     assert found is failed.problem and failed.problem.stage == "reset"
     assert (failed.kept, failed.at_run, failed.spoiled) == (kept, True, "")
     assert (guard.dropped, guard.failures) == (0, 1) and guard.task.failed and guard.rests()
-    guard.task.run("stepping", raises(Interrupted("stopped by hand")))
+    guard.task.run("stepping", raises(Interrupted("stopped by the user")))
     assert (guard.dropped, guard.failures, len(guard.sent)) == (1, 2, 2) and guard.rests()
 
 

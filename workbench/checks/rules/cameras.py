@@ -60,7 +60,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     A policy from pictures cannot act on an object that is in none of the pictures. Training raises no error,
     and the policy learns the same action for all places of the object.
 
-    ## Mend
+    ## Fix
     Aim the camera at the place where the objects are after a reset.
 
     ```python fragment
@@ -72,7 +72,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     Two envs are reset four times. The rule renders every sensor camera, once with the whole scene and once
     with each object alone. It reports an object that is out of view of all cameras in more than a quarter of
     the resets. It leaves out scenery, the robot, hidden bodies and bodies without visual shapes, and looks
-    for at most 30 objects. It notes objects that are covered by other things in every picture. It does not
+    for at most 30 objects. It notes objects that are hidden by other bodies in every picture. It does not
     look at later steps.
     """
     reports = checkup.look(sensor_reports)
@@ -113,7 +113,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
                 _place(checkup, key),
             )
     if covered:
-        yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
+        yield Note(f"hidden by other bodies in every picture after a reset: {listed(covered)}")
     if not found and (count := len(_drawn(env))) > MAX_OBJECTS:
         raise NotKnown(f"only {MAX_OBJECTS} of {count} objects were looked for")
 
@@ -128,7 +128,7 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
     A ray that meets nothing has depth 0, which a network reads as very near. Pixels of sky cost as much
     memory and time as all others, in each of thousands of envs.
 
-    ## Mend
+    ## Fix
     Aim the camera down at the scene.
 
     ```python fragment
@@ -163,11 +163,11 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     SAPIEN does not normalise the quaternion of a camera: a shorter one turns and zooms the picture. It also
-    scales the camera's matrices: points that are computed from depth lie elsewhere, and point clouds are
+    scales the camera's matrices: points that are computed from depth are shifted, and point clouds are
     wrong without an error. ManiSkill's `look_at` gives a quaternion of length 0.707 if it looks straight up
     or down.
 
-    ## Mend
+    ## Fix
     Move the eye aside by a millimetre.
 
     ```python fragment
@@ -208,7 +208,7 @@ def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
     ManiSkill keeps sensor cameras in a dict by name: of two cameras with the same name it makes only the last
     one, and a camera of the robot replaces the task's. Observations lack a picture, and no error says so.
 
-    ## Mend
+    ## Fix
     Give each camera its own name.
 
     ```python fragment
@@ -247,7 +247,7 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
     Every env has its own textures: at 1920 x 1080 pixels, 4096 envs need far more memory than a GPU has, and
     the renderer fails when training begins.
 
-    ## Mend
+    ## Fix
     Keep sensor cameras small, and give people a separate camera.
 
     ```python fragment
@@ -280,7 +280,7 @@ def ray_traced(checkup: Checkup) -> Iterator[Found | Note]:
     used for training. A machine whose driver does not trace rays in hardware, such as one with Mesa's
     software driver, cannot render these pictures in a useful time.
 
-    ## Mend
+    ## Fix
     Let the task render with `minimal` or `default`. Trace rays for a film only, with one env.
 
     ```python fragment

@@ -27,7 +27,7 @@ def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:
     on a GPU the first operation on this tensor and a pose raises *Expected all tensors to be on the same
     device*.
 
-    ## Mend
+    ## Fix
     Make tensors within the context of the device, or name the device.
 
     ```python fragment
@@ -68,7 +68,7 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     and `if tensor:` need the number now, so Python waits until the queue is empty, and the GPU then waits for
     Python. One copy for each of 4096 envs makes 4096 stops in every step.
 
-    ## Mend
+    ## Fix
     Compute with tensors only, and choose values by masks.
 
     ```python fragment
@@ -117,7 +117,7 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
     difference does not show. With 4096 envs on a GPU, each operation costs some 10 microseconds, whatever its
     size: a loop of five operations takes 0.2 s, longer than the simulation.
 
-    ## Mend
+    ## Fix
     Write the operation once for the batch, with `dim=1`, masks and `torch.where`.
 
     ```python fragment

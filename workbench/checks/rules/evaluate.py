@@ -44,7 +44,7 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     again. The success rate counts these episodes, and a policy that does nothing looks good. With thousands
     of envs, even a few percent of such starts shift the success rate.
 
-    ## Mend
+    ## Fix
     Place the goal farther away than the threshold reaches, or ask for more in `evaluate`.
 
     ```python fragment
@@ -94,7 +94,7 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ManiSkill makes the sparse reward from `success` and `fail`. If a task has neither, the sparse reward is 0
     at every step, no episode ends early, and no success rate can be counted.
 
-    ## Mend
+    ## Fix
     Return a bool tensor with a row for each env.
 
     ```python fragment
@@ -138,7 +138,7 @@ def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
     ManiSkill reads `success` and `fail` and passes all other entries on, also a misspelt `succes`: there is
     no error, episodes do not end, and the success rate is 0 after days of training.
 
-    ## Mend
+    ## Fix
     Rename the entry.
 
     ```python fragment
@@ -177,7 +177,7 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
     Vectorised wrappers slice every entry by env when some episodes end and others go on. A single number for
     the whole batch cannot be sliced: the wrapper drops it or fails.
 
-    ## Mend
+    ## Fix
     Return a row for each env, and take the mean where it is logged.
 
     ```python fragment
@@ -227,7 +227,7 @@ def success_and_fail(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     Both end the episode. The sparse reward adds 1 and subtracts 1, and logs count the episode as a success
     and as a failure.
 
-    ## Mend
+    ## Fix
     Decide which one wins.
 
     ```python fragment
@@ -290,7 +290,7 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     Evaluation counts success at the last step or at any step, and the two differ if success comes and goes.
     An episode ends at the first success, so a policy is rewarded for passing through the goal.
 
-    ## Mend
+    ## Fix
     Ask for a state that lasts.
 
     ```python fragment

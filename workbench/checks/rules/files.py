@@ -67,7 +67,7 @@ def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
     A path that exists on one machine only, a mesh that was not committed or a name with a typo stops the
     build on every other machine. On a cluster that happens after the job was scheduled.
 
-    ## Mend
+    ## Fix
     Keep files next to the task's file, and find them from there.
 
     ```python fragment
@@ -110,7 +110,7 @@ def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
     `asset_download_ids` tells ManiSkill what to fetch before the task is made. Without it, the build fails on
     a machine that has not downloaded the assets, or waits at a prompt that a cluster does not have.
 
-    ## Mend
+    ## Fix
     Name the download in the registration.
 
     ```python fragment

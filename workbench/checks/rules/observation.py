@@ -92,7 +92,7 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     A number that never changes tells a policy nothing. A normaliser divides by its variance of 0, and a later
     change of the constant breaks a trained policy.
 
-    ## Mend
+    ## Fix
     Leave the number out, or draw it in `_initialize_episode`.
 
     ```python fragment
@@ -153,7 +153,7 @@ def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     Without a normaliser, a number of 100000 drowns all others in the first layer. Most often the cause is a
     body that was moved far away, or a wrong unit.
 
-    ## Mend
+    ## Fix
     Give metres and radians, and clamp what may become large.
 
     ```python fragment

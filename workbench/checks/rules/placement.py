@@ -82,7 +82,7 @@ def overlap_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     another state than the one that the reset sets. The motion of these bodies changes the reward, and a
     policy learns to exploit this.
 
-    ## Mend
+    ## Fix
     Set z of a body to half of its height, and sample places that do not overlap.
 
     ```python fragment
@@ -169,7 +169,7 @@ def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     that the reset sets. Rewards change without an action, and `success` may become true or impossible by
     itself.
 
-    ## Mend
+    ## Fix
     Place bodies where they rest. Give a velocity to bodies that should move.
 
     ```python fragment
@@ -221,7 +221,7 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
     `self.num_envs`. A tensor of `self.num_envs` rows does not fit there and raises, or replaces what the task
     keeps for envs that are in the middle of an episode.
 
-    ## Mend
+    ## Fix
     Take the number of rows from `env_idx`, and write into the rows of those envs.
 
     ```python fragment
@@ -349,10 +349,10 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     SAPIEN and ManiSkill write quaternions as (w, x, y, z). SciPy, ROS and PyBullet write (x, y, z, w). In the
-    wrong order, a turn about the vertical becomes a body that lies upside down or on its side, without an
+    wrong order, a rotation about the z axis becomes a body that lies upside down or on its side, without an
     error.
 
-    ## Mend
+    ## Fix
     Write w first. From SciPy 1.14 on, `as_quat(scalar_first=True)` does so; with earlier versions, write
     `np.roll(q, 1, axis=-1)`.
 
@@ -365,7 +365,7 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule notes the quaternions that the author's lines set in a reset of the first seeds. If those of a
-    body are (0, 0, a, b) in all envs, and a and b differ from env to env, they are turns about the vertical
+    body are (0, 0, a, b) in all envs, and a and b differ from env to env, they are rotations about the z axis
     in the wrong order. The rule also searches the source for `as_quat()` in functions that neither ask for
     `scalar_first` nor reorder the numbers. (0, 0, 0, 1) in all envs is only noted, since it may be meant as
     half a turn. The rule does not recognise other rotations in the wrong order.
@@ -386,8 +386,8 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
         if np.ptp(rows[:, 2:], axis=0).max() > 0.05:
             found = True
             yield Found(
-                f"The quaternions of {name} are (0, 0, ...) in every env, such as {_text(rows[0])}: a turn about the "
-                "vertical, in the order x, y, z, w. Write w first: (w, x, y, z).",
+                f"The quaternions of {name} are (0, 0, ...) in every env, such as {_text(rows[0])}: a rotation about the "
+                "z axis, in the order x, y, z, w. Write w first: (w, x, y, z).",
                 place,
                 len(rows),
             )
@@ -426,7 +426,7 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
     distances between rotations are wrong. PhysX may or may not normalise the quaternion, so CPU and GPU may
     differ.
 
-    ## Mend
+    ## Fix
     Divide by the length, or make the quaternion from angles.
 
     ```python fragment
@@ -514,7 +514,7 @@ def robot_holds(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     its controllers are too weak for its weight, or the reset puts it outside its joint limits or into another
     body. Recorded actions in absolute joint positions then lead elsewhere.
 
-    ## Mend
+    ## Fix
     Raise stiffness, damping or force limit of the controller, or reset to a pose that the robot can hold.
 
     ```python fragment
@@ -584,7 +584,7 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     If a body is placed in a range that is wider than the robot's reach, some of the episodes cannot be
     solved. The success rate then has a ceiling that no training lifts, and nothing says why.
 
-    ## Mend
+    ## Fix
     Narrow the range, or move the robot nearer.
 
     ```python fragment

@@ -48,7 +48,7 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
     A trainer resets any of its envs at any step, with and without seeds, and tries actions that no person
     would. An error then ends the training, after minutes or hours.
 
-    ## Mend
+    ## Fix
     Work on the rows of `env_idx`; it may be a single row.
 
     ```python fragment
@@ -58,7 +58,7 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule resets random subsets of the envs six times, three times with seeds, and makes a step of random
+    The rule resets random subsets of the envs six times, three times with seeds, and takes a step of random
     actions after each reset; in the first step all actions are at their bounds. An error that the task raises
     in any other check is reported under this rule too. If several envs raise and one env does not, the
     finding says so. With one env no partial reset can be tried, and the result is *not known* unless
@@ -89,7 +89,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     or if something keeps its value from the last episode, then runs, bugs and demonstrations cannot be
     reproduced, and evaluations on fixed seeds measure luck.
 
-    ## Mend
+    ## Fix
     Draw random numbers with torch in `_initialize_episode`, where torch is seeded, and set everything that an
     episode changes.
 
@@ -148,7 +148,7 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
     and joints. It does not restore a goal that the task keeps as a tensor: reward and success are then those
     of another goal, and labels of a dataset are wrong.
 
-    ## Mend
+    ## Fix
     Give the goal a body, or add it to the state.
 
     ```python fragment
@@ -209,7 +209,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
     Demonstrations are stored as a seed and actions. If a step draws random numbers that no seed decides, or
     depends on something that a reset does not set, the same actions lead elsewhere.
 
-    ## Mend
+    ## Fix
     Draw in the reset, or in the step from the generators of the episodes.
 
     ```python fragment
@@ -265,7 +265,7 @@ def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     A demonstration is recorded with one env and replayed, or rendered again, with many envs. If the objects
     of a seed depend on the number of envs, the replay shows a hand that grasps where nothing is.
 
-    ## Mend
+    ## Fix
     Draw what is built from the generator of each env.
 
     ```python fragment

@@ -100,7 +100,7 @@ def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ## Why
     A reward that is the same everywhere gives no direction: the policy stays random.
 
-    ## Mend
+    ## Fix
     Let the reward depend on a distance that the robot changes.
 
     ```python fragment
@@ -204,7 +204,7 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     People choose between the two modes for the scale, not for the task. If one is not the other divided by a
     constant, results with one say little about the other.
 
-    ## Mend
+    ## Fix
     Compute the normalized reward from the dense reward.
 
     ```python fragment
@@ -302,7 +302,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     If the way to success earns more than success, a policy that maximises the reward stops just before it.
     The reward curve rises and the success rate does not.
 
-    ## Mend
+    ## Fix
     Give success the most, after all other terms.
 
     ```python fragment
@@ -389,7 +389,7 @@ def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     If a state without success earns the largest reward, waiting there earns as much as success, and more if
     success ends the episode.
 
-    ## Mend
+    ## Fix
     Leave the largest reward to success.
 
     ```python fragment
@@ -409,7 +409,7 @@ def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
     if given:
         yield Found(
-            f"The normalized reward is 1 without success in {given} states ({places[0]}): waiting there earns as much. "
+            f"The normalized reward is 1 without success in {given} states ({places[0]}): staying there earns as much as success. "
             'Let success give the most: `reward[info["success"]] = LARGEST_REWARD`.',
             rows[0].place,
             given,

@@ -47,7 +47,7 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
     first step before `_initialize_episode` is called. A robot that stands in the table or in a cube at that
     moment is pushed out with great force, in each of 4096 envs.
 
-    ## Mend
+    ## Fix
     Give the robot the place where it stands, or any other place where it touches nothing.
 
     ```python fragment
@@ -75,14 +75,14 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
 def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """Every builder has an initial_pose before its body is built.
 
-    Bodies are built inside each other at the origin, and the GPU simulation makes its first step there.
+    The GPU simulation makes its first step with the bodies inside each other at the origin.
 
     ## Why
     A builder without `initial_pose` puts its body at the origin, and ManiSkill prints a warning. Several such
     bodies are inside each other there. The GPU simulation makes a first step before `_initialize_episode` is
     called: the collision takes memory for contacts and can throw bodies away.
 
-    ## Mend
+    ## Fix
     Set a pose before the body is built, a different one for each body.
 
     ```python fragment
@@ -152,7 +152,7 @@ def _inside_others(checkup: Checkup) -> set[str]:
 def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     """Bodies do not overlap where they are built, before the first reset.
 
-    The GPU simulation makes its first step there: it may begin with an explosion, and it needs more memory
+    The first step of the GPU simulation may throw the bodies apart, and needs more memory
     for contacts.
 
     ## Why
@@ -161,7 +161,7 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     contacts in that step. With 4096 envs the buffers for contacts may overflow, and a body may be far away
     when training begins.
 
-    ## Mend
+    ## Fix
     Choose initial poses that are apart; the reset moves the bodies to where an episode begins.
 
     ```python fragment
@@ -173,7 +173,7 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule builds one env, puts all bodies to their initial poses with joints at zero, and reads the
-    contacts of one substep. Overlaps of 5 mm and more count. The rule leaves out links of one articulation,
+    contacts of one substep. Overlaps of at least 5 mm count. The rule leaves out links of one articulation,
     pairs in which neither body can move, and what [initial-pose](initial-pose.md) reports. It does not see
     overlaps in other envs, whose bodies may have other shapes.
     """
@@ -225,7 +225,7 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     A kinematic body has a row in the state of each env, and PhysX looks at it in each step. A static body has
     neither cost. With thousands of envs the difference in memory and time is large.
 
-    ## Mend
+    ## Fix
     Build the body static. Its place is its initial pose; a static body cannot be moved afterwards.
 
     ```python fragment
@@ -270,7 +270,7 @@ def body_names(checkup: Checkup) -> Iterator[Found | Note]:
     the second body replaces the first one in `scene.actor_views`, and the state of one of them is neither
     saved nor restored.
 
-    ## Mend
+    ## Fix
     Give each merged body its own name.
 
     ```python fragment
@@ -309,7 +309,7 @@ def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
     PhysX on the GPU takes articulations of at most 64 links. A longer one works on the CPU, so the task fails
     only where it is to train.
 
-    ## Mend
+    ## Fix
     Weld links that need no joint into one, or divide the articulation.
 
     ```python fragment
@@ -344,7 +344,7 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
     `add_convex_collision_from_file` collides as the convex hull of the mesh. A bowl, a cup or a box then has
     a lid that is not drawn: what is put into it lies on top, and no policy can solve the task.
 
-    ## Mend
+    ## Fix
     Collide as several convex parts, or as the mesh itself if the body never moves.
 
     ```python fragment
@@ -369,7 +369,7 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
             unknown.append(Path(file).name)
         elif hollow:
             yield Found(
-                f"{each.name} collides as the convex hull of {Path(file).name}, which is hollow: nothing can be put into "
+                f"The collision shape of {each.name} is the convex hull of {Path(file).name}, which is hollow: nothing can be put into "
                 "it. Use add_multiple_convex_collisions_from_file with a decomposed mesh, or boxes; for a body that "
                 "never moves, add_nonconvex_collision_from_file.",
                 each.place,
@@ -379,7 +379,7 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
 
 @rule("decomposition-at-load", "warn", "_load_scene")
 def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
-    """Convex decompositions are made once, not in every build.
+    """Convex decompositions are loaded from files, not made while a task loads.
 
     The first process on each machine waits for the decomposition, seconds to minutes for a mesh, and needs
     the package coacd.
@@ -390,7 +390,7 @@ def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     the same file; where the folder is read-only, the decomposition is made again each time. Making it also
     needs the package coacd on each machine.
 
-    ## Mend
+    ## Fix
     Make the decomposition once, ship the file that it writes, and load that file.
 
     ```python fragment
@@ -432,7 +432,7 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
     them, and a renderer on the GPU keeps them in memory. A picture of 128 x 128 pixels shows none of that
     detail.
 
-    ## Mend
+    ## Fix
     Reduce the mesh once, and draw the reduced one.
 
     ```python fragment
@@ -479,7 +479,7 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
     trajectory file of all envs, or restored in another env. If the merged body is not in the state at all,
     replays do not restore its pose.
 
-    ## Mend
+    ## Fix
     Remove the parts from the state dict, and add the merged actor.
 
     ```python fragment
@@ -545,7 +545,7 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
     An articulation, a static actor, an actor with collision shapes, and a merged actor that may have
     collision shapes cannot be hidden at all: every picture of a sensor fails.
 
-    ## Mend
+    ## Fix
     Hide the merged actor, and declare that this actor does not collide: ManiSkill does not determine that
     itself.
 
@@ -614,7 +614,7 @@ def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
 
 @rule("reconfigures", "warn", "_load_scene")
 def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
-    """A scene that is built at random is rebuilt now and then (reconfiguration_freq); with one env, at each
+    """A scene with random shapes is rebuilt regularly (reconfiguration_freq); with one env, at each
     reset.
 
     A single env trains on the same objects forever.
@@ -624,7 +624,7 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
     envs each env has another object, which is variety enough. A single env, as in evaluation and in data
     collection, has the same object forever.
 
-    ## Mend
+    ## Fix
     Rebuild one env at each reset, and many envs never.
 
     ```python fragment
@@ -643,8 +643,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
     alone = checkup.alone
     if len(set(alone.shapes.values())) > 1 and not alone.rebuilds:
         yield Found(
-            "Another seed gives other shapes or colours, but a single env keeps those of its first seed. Let __init__ take "
-            "`reconfiguration_freq=None` and, if it is None, give BaseEnv 1 for num_envs == 1 and 0 otherwise.",
+            "The shapes or colours depend on the seed, but a single env keeps those of its first seed. Let __init__ accept "
+            "`reconfiguration_freq=None` and, if it is None, pass 1 to BaseEnv for num_envs == 1, else 0.",
             checkup.places.hook("__init__", "_load_scene"),
         )
     elif not alone.rebuilds:
@@ -683,7 +683,7 @@ def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     out of nowhere, and episodes depend on each other. On the CPU each env has its own space, so nothing shows
     there.
 
-    ## Mend
+    ## Fix
     Raise the spacing, or keep the bodies nearer.
 
     ```python fragment

@@ -41,7 +41,7 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     A policy maximises the reward as written, not as meant. If something else pays as much as success,
     training ends there: the curve of the return looks perfect, and the success rate stays at 0.
 
-    ## Mend
+    ## Fix
     Look at the episodes that the finding names, and let the reward pay for what `evaluate` checks. A cube
     that is held above the target is near it in x and y only.
 
@@ -70,13 +70,13 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
 def reward_flat(checkup: Checkup) -> Iterator[Found | Note]:
     """While the task is unsolved, some actions earn more than others.
 
-    The reward gives no direction: training stays where it is flat.
+    The reward gives no direction: training gets stuck where it is flat.
 
     ## Why
     Where all actions earn the same, no gradient says what to do next. Training stays there, or gets away only
     by chance.
 
-    ## Mend
+    ## Fix
     Give the next stage a term that changes as soon as the robot moves. `tanh` of a large number is flat:
     choose its factor by the distances of the task. A sparse reward is flat everywhere, and needs
     demonstrations.
@@ -106,7 +106,7 @@ def reward_stuck(checkup: Checkup) -> Iterator[Found | Note]:
     The episode is in a local optimum: the way to success costs reward first, such as letting go of a cube
     that is near its goal, or going around an obstacle. A policy learns to stay.
 
-    ## Mend
+    ## Fix
     Pay for a stage that is reached and keep paying for it, so that the next stage never costs more than it
     brings. Or lower a penalty that is larger than what can be gained.
 
@@ -136,7 +136,7 @@ def reward_against(checkup: Checkup) -> Iterator[Found | Note]:
     Planning looks ahead and goes through a valley of the reward. A policy that learns from its own attempts
     comes to the edge of the valley and turns back.
 
-    ## Mend
+    ## Fix
     Let the reward of each stage start from the end of the stage before, and keep the terms of earlier stages.
 
     ```python fragment
@@ -162,7 +162,7 @@ def success_lost(checkup: Checkup) -> Iterator[Found | Note]:
     Whether an episode counts depends on the step at which success is read. The reward leads away from the
     success, so it pays for something other than what `evaluate` checks.
 
-    ## Mend
+    ## Fix
     Give success the highest reward, and ask in `evaluate` for a state that lasts.
 
     ```python fragment
@@ -185,11 +185,11 @@ def failing_pays(checkup: Checkup) -> Iterator[Found | Note]:
     A policy learns to end the episode as soon as it can.
 
     ## Why
-    If each step costs and a fail ends the episode, the earliest fail is the cheapest episode. A policy learns
+    If each step costs and a failure ends the episode, the earliest failure is the cheapest episode. A policy learns
     to drop the cube at once.
 
-    ## Mend
-    Let a fail cost more than all that an episode can cost, or make the rewards of steps positive.
+    ## Fix
+    Let a failure cost more than an episode without one can cost, or make the rewards of steps positive.
 
     ```python fragment
     reward = progress  # not progress - 1
@@ -199,7 +199,7 @@ def failing_pays(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
     reward. The rule reports a task if there are at least three episodes and more than half of them end by
-    `fail` with a mean reward below 0. A rollout earns nothing after its fail, since an episode ends there
+    `fail` with a mean reward below 0. A rollout earns nothing after its failure, since an episode ends there
     too.
     """
     yield from _verdict(checkup, "failing-pays", "compute_dense_reward")
@@ -216,7 +216,7 @@ def _verdict(checkup: Checkup, rule_id: str, hook: str) -> Iterator[Found | Note
 
 
 def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
-    """Evidence for `Checkup.look`: episodes of the first seeds. Each ends at its fail, at its time limit, or
+    """Evidence for `Checkup.look`: episodes of the first seeds. Each ends at its failure, at its time limit, or
     `STEPS_AFTER_SUCCESS` steps after its success.
 
     Raises:

@@ -59,7 +59,7 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     `gym.make` finds, and a time limit that a batch of envs does not get. The rule reports such an id too; the
     workbench uses the id and its limit.
 
-    ## Mend
+    ## Fix
     Write the decorator above the class.
 
     ```python fragment
@@ -95,7 +95,7 @@ def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
     of the earlier and of the later task stay apart in papers, logs and recordings. Without a version, a
     number does not say which of the two tasks it belongs to.
 
-    ## Mend
+    ## Fix
     End the id in `-v1`, and increase the number when results are no longer comparable.
 
     ```python fragment
@@ -128,7 +128,7 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
     policy does in the beginning, never resets: 4096 GPU envs then collect the same dead ends, and the return
     of an episode is never logged.
 
-    ## Mend
+    ## Fix
     Allow one and a half times as many control steps as a slow success needs.
 
     ```python fragment
@@ -161,7 +161,7 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
     `gym.make` makes the first one without an error: a training run spends hours on another task. The
     workbench opens the class of the file instead, so the mistake shows on a cluster only.
 
-    ## Mend
+    ## Fix
     Choose an id that no other task has.
 
     ```python fragment
@@ -194,7 +194,7 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
     were tried: rewards, reach and cameras were made for them, and ManiSkill warns about all others. If the
     default robot is not listed, each env logs a warning that hides other messages.
 
-    ## Mend
+    ## Fix
     List the robots, including the default one; a tuple stands for several robots at once.
 
     ```python fragment
@@ -240,7 +240,7 @@ def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
     its method fails at the first step with a bare `NotImplementedError`, after the job on the cluster has
     waited in the queue. A class that does not declare its modes claims all four.
 
-    ## Mend
+    ## Fix
     List the modes that the class has methods for; `sparse` needs only `success` or `fail` in `evaluate`.
 
     ```python fragment
@@ -290,7 +290,7 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
     at the origin, in all 4096 envs, inside the bodies that are there. A call of a method that does not exist
     fails only when its line runs, perhaps after hours, in a branch that seldom runs.
 
-    ## Mend
+    ## Fix
     Write the name that the finding proposes.
 
     ```python fragment
@@ -357,7 +357,7 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
     Python's own generator are not seeded: `reset(seed=3)` gives another episode each time. Runs,
     demonstrations and the one episode that failed cannot be repeated.
 
-    ## Mend
+    ## Fix
     Draw from torch at a reset, and from `self._batched_episode_rng` where the scene is built.
 
     ```python fragment
@@ -406,7 +406,7 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
     and `_gpu_apply_all()` exist in the GPU simulation only. The task runs on one of them, and on the other it
     raises or reads old state.
 
-    ## Mend
+    ## Fix
     Use ManiSkill's batched calls, or put the call behind the condition.
 
     ```python fragment

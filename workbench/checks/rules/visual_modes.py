@@ -44,7 +44,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     A policy that reads the poses of objects never learns to find the objects in the pictures. The policy
     seems to work, but cannot run on a real robot, which has no such numbers.
 
-    ## Mend
+    ## Fix
     Add the state of objects only if the mode has state.
 
     ```python fragment
@@ -57,7 +57,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     Two envs observe pictures. The rule moves each dynamic body and each articulation that is not a robot (40 at
-    most) by some centimetres without a step, and calls `_get_obs_extra` again: a number that changes follows
+    most) by a few centimetres without a step, and calls `_get_obs_extra` again: a number that changes follows
     the body. Goals (kinematic and hidden bodies) may be in the observation. Contacts and forces do not change
     without a step, so `is_grasping` is no finding. The result is *not known* if there is no renderer, and
     *not applicable* for a task that has no observation mode with pictures, or in which nothing but the robot
@@ -95,7 +95,7 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     `_hidden_objects` are not in the pictures. If the goal is one of them and its place is not in the
     observation either, the policy can only learn the mean of all goals.
 
-    ## Mend
+    ## Fix
     Put the goal into the observation in all modes.
 
     ```python fragment
@@ -104,7 +104,7 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    Two envs observe pictures. The rule moves each body of `_hidden_objects` by some centimetres. It reports a
+    Two envs observe pictures. The rule moves each body of `_hidden_objects` by a few centimetres. It reports a
     body if nothing of `_get_obs_extra` changes, although an entry of `evaluate()` or the dense reward does.
     The result is *not applicable* without hidden bodies. The rule does not see a goal that the task keeps in
     a tensor.

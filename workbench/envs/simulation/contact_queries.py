@@ -84,11 +84,11 @@ class ContactReader:
     def invalidate(self) -> None:
         self._cache = None
 
-    def stepped(self, but: Collection[int] = ()) -> None:
-        """Note that all systems except those in `but` made a substep: PhysX's lists of their contacts are
+    def stepped(self, exclude: Collection[int] = ()) -> None:
+        """Note that all systems except those in `exclude` made a substep: PhysX's lists of their contacts are
         valid again."""
         self._cache = None
-        self._carried = {env: touching for env, touching in self._carried.items() if env in but}
+        self._carried = {env: touching for env, touching in self._carried.items() if env in exclude}
 
     def carry(self, system: int, contacts: list[tuple[tuple[int, int], NDArray[np.float32]]]) -> None:
         """Use these contacts, as returned by `counted`, for one system until its next substep.

@@ -249,8 +249,8 @@ def _pairs(
         raise ValueError("source needs env_idx: name the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
         raise IndexError(
-            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name the envs to "
-            "restore with env_idx, and the envs whose state they get with source"
+            f"the snapshot holds envs {list(snapshot.env_idx)}, but this env has only {env.num_envs}: pass env_idx, the envs "
+            "to restore, and source, the envs of the snapshot to copy from"
         )
     targets = envs_of_batch(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
     if source is None:

@@ -145,7 +145,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
         if view.options_refused is not None:
             # The task works with the options in effect: loading it with these removes the problem from the
             # page.
-            self._session.happen(OptionsApplied(view.options))
+            self._session.dispatch(OptionsApplied(view.options))
 
     def _apply(self) -> None:
         options = self._session.view().options
@@ -158,13 +158,13 @@ class EnvOptionsPanel(PagePart[SessionView]):
             raise Refused(str(why)) from None
         wanted = replace(options, num_envs=self._num_envs, env_kwargs=merged(options.env_kwargs, values))
         if changed_options(options, wanted):
-            self._session.happen(OptionsApplied(wanted))
+            self._session.dispatch(OptionsApplied(wanted))
 
     def _as_the_task_does(self) -> None:
         """Drop the user's keyword arguments, except `RUN_KEYWORDS`."""
         options = self._session.view().options
         kept = _of_the_machine(options.env_kwargs)
-        self._session.happen(OptionsApplied(replace(options, env_kwargs=kept)))
+        self._session.dispatch(OptionsApplied(replace(options, env_kwargs=kept)))
 
 
 def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str, Any]:

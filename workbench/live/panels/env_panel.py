@@ -493,7 +493,7 @@ class EnvPanel(MomentPart):
         if rows is None or not 0 <= env < rows.num_envs:
             raise Refused(f"There is no env {env}.")
         step = moment_of(rows, env)
-        self._session.happen(
+        self._session.dispatch(
             SettingsChanged({"selected_env": env}) if step is None else EpisodeStepShown(env, step)
         )
 
@@ -507,7 +507,7 @@ class EnvPanel(MomentPart):
         rows = self._session.view().env_table
         env = None if rows is None else first_flagged(rows)
         if env is not None:
-            self._session.happen(EnvEventShown(env, "flagged"))
+            self._session.dispatch(EnvEventShown(env, "flagged"))
 
     def _select_next(self, wanted: EnvEvent, or_else: EnvEvent | None = None) -> None:
         """Select the next env (by number, wrapping around) with the wanted event in its present or previous
@@ -527,4 +527,4 @@ class EnvPanel(MomentPart):
                 else "No env's last episode failed or reached the time limit."
             )
         later = envs[envs > self._session.view().selected_env]
-        self._session.happen(EnvEventShown(int(later[0] if len(later) else envs[0]), wanted))
+        self._session.dispatch(EnvEventShown(int(later[0] if len(later) else envs[0]), wanted))

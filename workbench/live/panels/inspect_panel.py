@@ -301,7 +301,7 @@ class InspectPanel(PagePart[SessionView]):
         shows_contacts = self._tabs.shows(self._forces_on, TAB) or (self.body and is_open)
         needed = {CHOICES[self._chosen] if is_open else None, "contacts" if shows_contacts else None}
         sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in needed)
-        self._session.happen(ReadingChosen(sections, self.body if is_open else ""))
+        self._session.dispatch(ReadingChosen(sections, self.body if is_open else ""))
 
     def _take(self, view: SessionView) -> None:
         new = view.inspection

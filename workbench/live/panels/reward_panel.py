@@ -223,7 +223,7 @@ class CurvesPanel(MomentPart):
             case ChooseBeside(beside=beside):
                 self._beside = beside
             case SeekOnCurve(step=step):
-                self._session.happen(EpisodeStepShown(self._session.view().selected_env, step))
+                self._session.dispatch(EpisodeStepShown(self._session.view().selected_env, step))
         self._turned += 1
 
 
@@ -288,7 +288,7 @@ class NumberRow:
     name: str
     selected: str
     batch: str
-    mood: str = ""
+    tone: str = ""
     """``good`` or ``bad`` for success and failure of the selected env, else empty."""
     whole: str = ""
     """The value of an entry that is not per env, instead of `selected` and `batch`."""
@@ -320,10 +320,10 @@ def number_rows(
         if key.startswith(TERM_PREFIX) and values.ndim == 1:
             rows.append(_earned_row(key, values, step, env))
             continue
-        mood = ""
+        tone = ""
         if key in first and values.ndim and env < len(values) and bool(np.any(values[env])):
-            mood = "good" if key == "success" else "bad"
-        rows.append(NumberRow(str(key), _item(values, env), _batch(values), mood))
+            tone = "good" if key == "success" else "bad"
+        rows.append(NumberRow(str(key), _item(values, env), _batch(values), tone))
     if hidden := len(first) + len(rest) - len(shown):
         rows.append(NumberRow(f"… and {hidden} more", "", ""))
     return rows

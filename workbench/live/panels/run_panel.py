@@ -108,9 +108,9 @@ class ActionSliders:
                 if dimension >= len(self._dimensions):
                     raise Refused(f"The robot's action has only {len(self._dimensions)} dimensions.")
                 low, high = slider_bounds(self._dimensions[dimension])
-                self._session.happen(SlidersMoved((dimension,), (min(max(value, low), high),), envs))
+                self._session.dispatch(SlidersMoved((dimension,), (min(max(value, low), high),), envs))
             case HoldStill():
-                self._session.happen(SlidersMoved((), (), envs))
+                self._session.dispatch(SlidersMoved((), (), envs))
             case ChooseMoved(envs=moved):
                 self._moved = moved
 

@@ -193,7 +193,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
                 if self._episode_only:
                     session.do(self._seek_to(self._range[0]))
                 else:
-                    session.happen(MomentShown(0))
+                    session.dispatch(MomentShown(0))
             case ZoomTimeline(episode_only=wanted):
                 self._episode_only, self._range_at = wanted, -math.inf
             case ChooseStripCurve(curve=curve):

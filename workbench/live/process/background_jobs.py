@@ -120,5 +120,5 @@ class Jobs:
 class StoppedBy(Enum):
     """Why a job ended early; the value is the page's text."""
 
-    HAND = "stopped by hand"
+    USER = "stopped by the user"
     SAVE = "the file was saved again"

@@ -343,4 +343,4 @@ class Interrupts:
 
     def _raise(self) -> None:
         self._waiting = False
-        raise Interrupted(f"stopped by hand after {time.monotonic() - self._began:.1f} s")
+        raise Interrupted(f"stopped by the user after {time.monotonic() - self._began:.1f} s")

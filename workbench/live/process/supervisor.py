@@ -451,7 +451,7 @@ class Supervisor:
         now = time.monotonic()
         beat = worker.beat()
         if self._replace_asked:
-            state.why = "was stopped by hand"
+            state.why = "was stopped by the user"
             self._end(worker, state)
         if not worker.main_thread_ended():
             state.headless_since = None

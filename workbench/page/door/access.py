@@ -175,9 +175,9 @@ def _without_token(path: str) -> str:
 def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     """Decide on one request or handshake. Never raises, for any client input.
 
-    Checks, in this order. *Host*: is the name ours? A rebound name never is. *Origin*: does the requesting
-    page come from exactly this address? *Sec-Fetch-Site*: does a request without an Origin (such as that of an
-    image or script tag) come from a foreign page? *Token*: 256 random bits, first in the printed address, afterwards
+    Checks, in this order. *Host*: must name this server; after DNS rebinding it does not. *Origin*: if present, must be
+    exactly this address. *Sec-Fetch-Site*: a request without an Origin (such as that of an image or script tag) must not
+    come from a page of another site. *Token*: 256 random bits, first in the printed address, afterwards
     in a cookie that scripts cannot read and that pages of other sites do not send.
 
     Not prevented: cookies ignore ports, so another *server* that the author visits under the same host name gets our cookie

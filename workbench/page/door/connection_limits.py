@@ -45,10 +45,9 @@ _TOO_LONG = Response(
 class ConnectionLimits:
     """All connections that have not presented the token yet. Used on their event loop.
 
-    A connection costs a task and buffers before its client has presented the token, so until then its
-    duration and the size of its head are limited, and so is the number of such connections. If there are too
-    many, the peer with the most connections loses its oldest one, not the newest: a browser sends its request
-    with the first packet, and idle sockets of an attacker must not lock the browser out. (Chromium itself
+    A connection uses a task and buffers before its client has presented the token. Until then, its duration, the
+    size of its headers and the number of such connections are limited. If there are too many, the peer with the
+    most connections loses its oldest one. The newest stays: a browser sends its request with the first packet, and idle sockets of an attacker must not lock the browser out. (Chromium itself
     holds some idle sockets, and opens new ones when these are closed.)
     """
 

@@ -147,7 +147,7 @@ class GatedServer:
         A server on loopback has only the first."""
         token = self._access_check.rules.token
         shown = f"?token={token}" if token else ""
-        hosts = dict.fromkeys((self._listening.host, *self._listening.hosts_elsewhere()))
+        hosts = dict.fromkeys((self._listening.host, *self._listening.external_hosts()))
         return tuple(f"http://{host}:{self.port}{path}{shown}" for host in hosts)
 
     def renew_token(self) -> str:

@@ -55,7 +55,7 @@ class Listening:
         to = f"{self.host if self.loopback else '127.0.0.1'}:{self.port}" if self.path is None else self.path
         return f"ssh -L {self.port}:{to} {_user()}@{socket.gethostname()}"
 
-    def hosts_elsewhere(self) -> tuple[str, ...]:
+    def external_hosts(self) -> tuple[str, ...]:
         """This machine's name and addresses for browsers on other machines. When listening on every interface, loopback is
         last: for a container's published port, loopback is the address that works on the host."""
         if self.loopback:

@@ -149,7 +149,7 @@ def wait_until_taken(server: viser.ViserServer, timeout: float) -> None:
         time.sleep(0.0005)
 
 
-def remove_nodes_but(server: viser.ViserServer | viser.ClientHandle, kept: tuple[str, ...]) -> None:
+def remove_nodes_except(server: viser.ViserServer | viser.ClientHandle, kept: tuple[str, ...]) -> None:
     """Remove every node of the 3-D view except those at and below these names."""
     for name, handle in list(server.scene._handle_from_node_name.items()):
         stays = name == "/WorldAxes" or any(name == root or name.startswith(f"{root}/") for root in kept)

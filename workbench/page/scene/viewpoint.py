@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from viser.transforms import SO3
 
 from workbench.envs.camera_data import Picture
-from workbench.page.door.viser_private import remove_nodes_but
+from workbench.page.door.viser_private import remove_nodes_except
 from workbench.page.scene.bodies import NAMES as BODIES
 from workbench.page.scene.bodies import SceneView
 from workbench.page.scene.env_grid import MARGIN_METRES, EnvLayout, box_corners
@@ -154,7 +154,7 @@ class Framing:
     def frame_new(self, frame: Frame) -> None:
         """Frame the new scene in every open page and in pages opened later, except pages that returned to their earlier
         viewpoint."""
-        self.frame(frame, but=self._came_back)
+        self.frame(frame, exclude=self._came_back)
 
     def follow(self) -> int:
         """Drop closed pages; returns the number of open ones."""
@@ -168,14 +168,14 @@ class Framing:
         """Client ids of the open pages that were pointed at the scene."""
         return frozenset(self._pointed)
 
-    def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:
+    def frame(self, frame: Frame, untouched_only: bool = False, exclude: Set[int] = frozenset()) -> None:
         """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
         clients = self._server.get_clients()
         # Before the initial viewpoint changes: a page may still be at the present one.
         framed = [
             client
             for number, client in clients.items()
-            if number not in but and (not untouched_only or self._is_untouched(client))
+            if number not in exclude and (not untouched_only or self._is_untouched(client))
         ]
         usual = frame(DEFAULT_ASPECT)
         self._server.initial_camera.position = usual.position
@@ -268,9 +268,9 @@ class View3D:
         """Remove everything of a page except the bodies and lights."""
         # Callbacks first: a click that arrives now has no page to handle it.
         self._server.scene.remove_click_callback("all")
-        remove_nodes_but(self._server, (*BODIES, "/lights"))
+        remove_nodes_except(self._server, (*BODIES, "/lights"))
         for client in self._server.get_clients().values():
-            remove_nodes_but(client, ())
+            remove_nodes_except(client, ())
 
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
