@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,14 +10,11 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
-from PIL import Image
 
+from workbench.episodes import thumbnail
 from workbench.episodes.document import SHARED, CameraJson, ColumnType, Description, SceneJson, checksum
-from workbench.episodes.encoded_pictures import small_jpeg
 from workbench.episodes.episode import Episode
 from workbench.episodes.seal import seal
-
-THUMBNAIL_PIXELS = 160
 
 
 def describe(episode: Episode) -> Description:
@@ -68,26 +63,9 @@ def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed:
     return msgspec.structs.replace(
         description,
         source_path=None if source is None else _relative(source, os.fspath(folder.resolve())),
-        thumbnail=thumbnail(_sample(episode)),
+        thumbnail=thumbnail.of_episode(episode),
         made_here=seal(description, source) if sealed else None,
     )
-
-
-def _sample(episode: Episode) -> bytes | None:
-    """The episode's last picture (JPEG), from a human-render camera if there is one."""
-    seen = [camera for camera in episode.cameras if camera.rgb is not None]
-    if not seen:
-        return None
-    pictures = max(seen, key=lambda camera: (camera.info.kind == "human", camera.frame[-1])).rgb
-    return None if pictures is None else pictures.blob(-1)
-
-
-def thumbnail(picture: bytes | None) -> str | None:
-    """`picture` (JPEG) scaled down, in base64."""
-    if picture is None:
-        return None
-    with Image.open(io.BytesIO(picture)) as image:
-        return base64.b64encode(small_jpeg(image, THUMBNAIL_PIXELS)).decode()
 
 
 def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnType]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from workbench.episodes import thumbnail
 from workbench.episodes.document import (
     Document,
     EpisodeJson,
@@ -18,9 +17,8 @@ from workbench.episodes.document import (
     read_notes,
     wrong_size,
 )
-from workbench.episodes.encoded_pictures import open_picture, small_jpeg
 from workbench.episodes.episode import acted_by_text, parse_acted_by
-from workbench.episodes.maniskill.safe_h5 import MAX_NODES, H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.episodes.maniskill.safe_h5 import MAX_NODES, H5Dataset, RefusedH5, open_h5
 from workbench.episodes.reader.scan import DATASET_KEY, NOTES, RecordingFiles, broken
 from workbench.episodes.row import (
     Facts,
@@ -39,14 +37,8 @@ from workbench.episodes.row import (
 from workbench.machine.files import NotARegularFile, open_regular_file
 from workbench.machine.text import listed
 
-THUMBNAIL_PIXELS = 96
-THUMBNAIL_BYTES = 8192
-"""Size up to which recorded thumbnails are used unchanged."""
 MAX_EPISODES = 20_000
 """Maximum number of episodes of one file that are listed."""
-
-_MAX_PICTURE_PIXELS = 4096
-"""Thumbnails are made only from pictures whose longer side has at most this many pixels."""
 
 
 def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) -> list[LibraryEntry]:
@@ -122,7 +114,7 @@ def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
             problem = f"{name}{suffix} was cut short or changed: {why}."
     described = document.data["workbench"]
     facts = replace(_episode("workbench", described, found.times[".json"] / 1e9), problem=problem)
-    return facts, _thumbnail(described.get("thumbnail"))
+    return facts, thumbnail.from_description(described.get("thumbnail"))
 
 
 def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Facts:
@@ -159,21 +151,6 @@ def _acted_by(data: object) -> str:
         return clean_text(acted_by_text(parse_acted_by(data)))
     except (TypeError, ValueError):
         return ""
-
-
-def _thumbnail(encoded: object) -> bytes | None:
-    """A small JPEG from the base64 in a description; None if it is not a picture."""
-    if not isinstance(encoded, str):
-        return None
-    try:
-        content = base64.b64decode(encoded.partition("base64,")[2] or encoded)
-        with open_picture(content) as image:
-            if image.format == "JPEG" and max(image.size) <= 2 * THUMBNAIL_PIXELS:
-                if len(content) <= THUMBNAIL_BYTES:
-                    return content
-            return small_jpeg(image, THUMBNAIL_PIXELS)
-    except (ValueError, OSError):
-        return None
 
 
 def _maniskill_entries(
@@ -274,7 +251,7 @@ def _read_h5(
                 rewards = group.get("rewards")
                 if isinstance(rewards, H5Dataset) and rewards.is_numbers:
                     totals[name] = total(float(rewards.read().sum(dtype=np.float64)))
-                if (picture := _last_picture(group)) is not None:
+                if (picture := thumbnail.from_trajectory(group)) is not None:
                     pictures[name] = picture
     except RefusedH5 as error:
         return totals, pictures, f"{path.name} {error}.", others
@@ -283,18 +260,6 @@ def _read_h5(
     except (OSError, RuntimeError, KeyError, ValueError):
         return totals, pictures, f"{path.name} is damaged, or still being written.", others
     return totals, pictures, None, others
-
-
-def _last_picture(group: H5Group) -> bytes | None:
-    """A small JPEG of the first camera's last colour picture; None if there is none."""
-    cameras = group.group("obs/sensor_data")
-    for name in cameras or ():
-        camera = None if cameras is None else cameras.group(name)
-        rgb = None if camera is None else camera.get("rgb")
-        if isinstance(rgb, H5Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
-            if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _MAX_PICTURE_PIXELS:
-                return small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)), THUMBNAIL_PIXELS)
-    return None
 
 
 def _rrd_only(folder: Path, found: RecordingFiles) -> LibraryEntry:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from workbench.envs.scene.shapes import SharedShapes
+from workbench.episodes import thumbnail
 from workbench.episodes.document import task_file
 from workbench.episodes.encoded_pictures import Modality
 from workbench.episodes.episode import Episode
@@ -47,10 +48,8 @@ RECOVERY_SECONDS = 1800.0
 PICTURE_WAIT_SECONDS = 0.2
 """Timeout of a picture request that waits while another recording is being opened."""
 MAX_READERS = 4
-MAX_THUMBNAIL_BYTES = 64 << 10
 _BATCH_ROWS = 8
 """Number of requests that are sent at once: the reader works on the next one while an answer is unpacked."""
-_JPEG = b"\xff\xd8\xff"
 T = TypeVar("T")
 
 _lock = threading.Lock()
@@ -236,7 +235,7 @@ def _link_targets(paths: Iterable[Path]) -> list[Path]:
 def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[LibraryEntry]:
     answer = answered.answer if isinstance(answered, Answered) else answered
     if isinstance(answer, RowsRead):
-        return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
+        return [(clean_facts(facts), thumbnail.checked(jpeg)) for facts, jpeg in answer.entries]
     why = "returned an invalid row"
     if isinstance(answer, ReadFailed):
         why = answer.message
@@ -245,11 +244,6 @@ def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[Li
     # Any of the files may be the cause.
     suffixes = ", ".join(suffix for suffix in found.sizes if suffix != NOTES)
     return [broken(found, f"{Path(found.key).name} ({suffixes}) {why}.")]
-
-
-def _thumbnail(jpeg: bytes | None) -> bytes | None:
-    """`jpeg` if it is a JPEG that is small enough for the browser; else None."""
-    return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= MAX_THUMBNAIL_BYTES else None
 
 
 def _request(
