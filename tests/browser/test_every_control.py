@@ -81,11 +81,13 @@ class Board:
         """Press the part; return whether a command was sent or a text copied."""
         self.close_dialog()
         before = self.page.evaluate("asked")
-        if not part.is_visible():
+        # The elements that there are now: a locator would wait for a part that a redraw has just removed.
+        elements = part.element_handles()
+        if not elements or not elements[0].is_visible():
             return False
         # Playwright's own click would wait for the picture to be stable, and it is redrawn all the time.
-        part.evaluate("p => p.scrollIntoView({block: 'center'})")
-        box = part.bounding_box()
+        elements[0].evaluate("p => p.scrollIntoView({block: 'center'})")
+        box = elements[0].bounding_box()
         if box is None:
             return False
         self.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + min(box["height"] / 2, 10))

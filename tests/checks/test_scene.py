@@ -115,7 +115,7 @@ def test_an_open_box_with_a_convex_hull(checked: Checked, tmp_path: Path) -> Non
     open_box().export(tmp_path / "box.stl")
     call = "add_convex_collision_from_file({})"
     finding = the_finding(checked("hull-fills-hollow", meshed(tmp_path / "box.stl", call), seeds=4))
-    assert "thing collides as the convex hull of box.stl" in finding.message
+    assert "thing is the convex hull of box.stl" in finding.message
 
 
 def test_a_convex_decomposition_while_building(checked: Checked) -> None:

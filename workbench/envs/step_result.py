@@ -69,6 +69,8 @@ class StepResult:
     """(N, J) positions of the joints of `envs.scene.scene_index.joint_names`, in rad or m; None if there are none."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
     """All other entries of ``evaluate()``; no name is also in `evaluate`."""
+    forces: dict[tuple[str, str], NDArray[np.float32]] = field(default_factory=dict)
+    """(N,) newtons between the bodies of each watched pair, see `envs.contact_forces`."""
     drawn: dict[str, Drawing] = field(default_factory=dict)
     """What the task drew with `workbench.draw`, by name."""
 

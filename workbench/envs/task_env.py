@@ -24,6 +24,7 @@ from workbench.envs.backends import (
 )
 from workbench.envs.broken_rule import BrokenRules, warn_of
 from workbench.envs.camera_data import PictureDegree
+from workbench.envs.contact_forces import BodyPair, pair_forces
 from workbench.envs.cpu_scene import batched_class, refuse_unbuilt_env
 from workbench.envs.evaluate_entries import FLAGS, flat_entries, split_entries
 from workbench.envs.gpu_rules import Degree, Finding, degrees_of
@@ -197,6 +198,8 @@ class TaskEnv:
         self.obs: Any = obs
         """The last observation, as the task's ``obs_mode`` gives it."""
         self._check = check
+        self.watched_forces: tuple[BodyPair, ...] = ()
+        """Pairs of bodies whose contact forces are in each `StepResult`."""
 
     @property
     def num_envs(self) -> int:
@@ -353,6 +356,7 @@ class TaskEnv:
             qpos=read_joints(self.env),
             action=None if action is None else np.array(action, dtype=np.float32),
             sound_obs=_sound(self.obs, count) if look else None,
+            forces=pair_forces(self.env, self.watched_forces, (elapsed > 0) & (action is not None)),
             drawn=drawings.of_batch(count) if drawings.on else {},
         )
 

@@ -14,6 +14,7 @@ Angle = Literal["roll", "pitch", "yaw"]
 Side = Literal["x_min", "x_max", "y_min", "y_max"]
 Deflection = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+BodyName = Annotated[str, msgspec.Meta(max_length=256)]
 RobotName = Annotated[str, msgspec.Meta(max_length=256)]
 JointNumber = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -205,6 +206,15 @@ class MeasureFrom(Command, frozen=True):
     """Measure distances from the selected body to the next one that is selected."""
 
     context = "live"
+
+
+class WatchForce(Command, frozen=True):
+    """Add the contact force between two bodies to the curves and to Pause when, or remove it."""
+
+    context = "live"
+    body: BodyName
+    other: BodyName
+    on: bool
 
 
 class DragJoint(Command, frozen=True):

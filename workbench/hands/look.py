@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -12,7 +13,7 @@ from viser.transforms import SO3
 
 from workbench.envs.inspection import BodyReadings
 from workbench.envs.scene.shapes import SceneGeometry
-from workbench.hands.commands import FrameBody, HideBody, MeasureFrom, ShowHiddenBodies, TrackBody
+from workbench.hands.commands import FrameBody, HideBody, MeasureFrom, ShowHiddenBodies, TrackBody, WatchForce
 from workbench.hands.panel import Selected
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
@@ -68,7 +69,7 @@ class BodyView(PagePart[SessionView]):
 
     def key(self, view: SessionView) -> object:
         shown = self._body(), view.step_serial, view.task_serial, view.selected_env
-        return *shown, self._hidden, self._follows, self._measured
+        return *shown, self._hidden, self._follows, self._measured, view.settings.watched_forces
 
     def draw(self, view: SessionView) -> None:
         body, names = self._body(), () if view.task is None else view.task.geometry.body_names
@@ -80,6 +81,11 @@ class BodyView(PagePart[SessionView]):
                 Tool("Hide", HideBody(), with_key(HideBody), on=body in self._hidden),
                 Tool("Measure from", MeasureFrom(), with_key(MeasureFrom), on=self._measured == body),
             ]
+        watched = view.settings.watched_forces
+        pair = min(body, self._measured), max(body, self._measured)
+        if body in names and self._measured in names and body != self._measured and pair not in watched:
+            watch = WatchForce(body=body, other=self._measured, on=True)
+            rows.append(Tool(f"Watch force with {self._measured}", watch, WatchForce.help()))
         if hidden := self._hidden & set(names):
             count = f"Show hidden ({len(hidden)})"
             rows.append(
@@ -88,6 +94,9 @@ class BodyView(PagePart[SessionView]):
         self._html.visible = bool(rows)
         note = self._distance(view, body)
         self._html.content = tools_html(rows) + (render("note", text=note) if note else "")
+        if watched:
+            self._html.visible = True
+            self._html.content += render("watched_forces", rows=_force_rows(view), stop=_stop_watching)
 
     def _distance(self, view: SessionView, body: str) -> str:
         """The distance from body `_measured` to the selected body, as text; if they are the same body, what
@@ -207,6 +216,21 @@ def _place(view: SessionView, poses: NDArray[np.float32], body: str, offset: Flo
         return None
     place = poses[view.selected_env, names.index(body), :3].astype(np.float64) + offset
     return place if np.isfinite(place).all() else None
+
+
+def _force_rows(view: SessionView) -> list[tuple[str, str, str]]:
+    """The bodies of each watched pair, and their force in the selected env at the shown moment."""
+    forces = {} if view.step is None else view.step.forces
+    rows: list[tuple[str, str, str]] = []
+    for body, other in view.settings.watched_forces:
+        newtons = forces.get((body, other))
+        value = math.nan if newtons is None else float(newtons[view.selected_env])
+        rows.append((body, other, "after the next step" if math.isnan(value) else f"{value:.3g} N"))
+    return rows
+
+
+def _stop_watching(body: str, other: str) -> WatchForce:
+    return WatchForce(body=body, other=other, on=False)
 
 
 def _ends(view: SessionView, start: str, end: str) -> Floats | None:

@@ -119,6 +119,10 @@ def _begin(search: ResetSearch, run: Run) -> Change:
         raise Refused(
             "A first state has no reward, because only a step computes it. Choose an entry of evaluate."
         )
+    if column is not None and column.group is Group.FORCE:
+        raise Refused(
+            "A first state has no contact forces, because only a step finds contacts. Choose an entry of evaluate."
+        )
     goes_on = search.condition == condition and search.state in ("stopped", "not found")
     last = search.seed if goes_on else run.seed
     seeds = range(last, MAX_SEED, run.num_envs)[1 : 1 + MAX_RESETS]

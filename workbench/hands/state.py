@@ -19,6 +19,7 @@ from workbench.hands.commands import (
     ToggleDriving,
     ToggleReach,
     UseKeyframe,
+    WatchForce,
     WriteQpos,
 )
 from workbench.hands.drive_keys import GRIPPER_KEY, bindings, driven_action, gripper
@@ -63,10 +64,12 @@ DOES: frozenset[type[Command]] = frozenset(
         DragJoint,
         SetJoint,
         UseKeyframe,
+        WatchForce,
         WriteQpos,
     }
 )
 """Commands that `apply` handles."""
+MAX_WATCHED_FORCES = 8
 LET_GO_SECONDS = 0.3
 """Held keys count as released when the page has not reported for this long. While it is open and connected,
 the page reports three times in this period."""
@@ -206,6 +209,8 @@ def apply(
             return replace(hands, reach=reach), requests
         case Asked(command=ChooseMovedEnvs(all_envs=all_envs)):
             return replace(hands, all_envs=all_envs), []
+        case Asked(command=WatchForce() as command):
+            return hands, [_watch_force(run, command)]
         case Asked(command=DragJoint(robot=robot, joint=joint, to=to)):
             return _set_joint(hands, run, robot, joint, to, ends=False)
         case Asked(command=SetJoint(robot=robot, joint=joint, to=to)):
@@ -469,6 +474,21 @@ def _drive_joint(run: Run, joint: Joint, envs: tuple[int, ...], position: float)
     request = Send(SetSliderAction(envs, (joint.target.dimension,), (value,)))
     takes_over = Then(SettingsChanged({"action_source": "sliders"}))
     return [request] if run.settings.action_source == "sliders" else [takes_over, request]
+
+
+def _watch_force(run: Run, command: WatchForce) -> Then:
+    bodies = () if run.task is None else run.task.geometry.body_names
+    pair = min(command.body, command.other), max(command.body, command.other)
+    kept = tuple(one for one in run.settings.watched_forces if one != pair)
+    if not command.on:
+        return Then(SettingsChanged({"watched_forces": kept}))
+    if missing := [name for name in pair if name not in bodies]:
+        raise Refused(f"The scene has no body {missing[0]}.")
+    if pair[0] == pair[1]:
+        raise Refused("Choose two bodies: a body has no contact force with itself.")
+    if len(kept) >= MAX_WATCHED_FORCES:
+        raise Refused(f"{MAX_WATCHED_FORCES} forces are watched already: stop watching one of them.")
+    return Then(SettingsChanged({"watched_forces": (*kept, pair)}))
 
 
 def _use_keyframe(hands: Hands, run: Run, name: str, keyframe: str) -> Send:

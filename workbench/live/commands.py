@@ -87,7 +87,7 @@ class ResetEnvOptions(Command, frozen=True):
 class ToggleCurve(Command, frozen=True):
     """Show or hide the curve of an entry."""
 
-    group: Literal["reward", "reward term", "evaluate", "joint"]
+    group: Literal["reward", "reward term", "evaluate", "joint", "contact force"]
     name: str
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from workbench.actions.sources import ActionSource
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, Picture
+from workbench.envs.contact_forces import BodyPair
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Section
 from workbench.envs.recorded_run import RecordedRun
@@ -119,6 +120,8 @@ class Settings:
     """Cameras to draw in the selected env; none while no page is open."""
     pictures: ShownPictures = "auto"
     """Quality of the pictures of these cameras."""
+    watched_forces: tuple[BodyPair, ...] = ()
+    """Pairs of bodies whose contact forces each step has from the next step on."""
 
 
 @dataclass(frozen=True)

@@ -341,6 +341,7 @@ class Worker:
         self._followed.forget()
         self._arms.forget()
         before, self._task.opened = self._task.opened, opened
+        opened.env.watched_forces = self._settings.watched_forces
         self._task.failed = False
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):
@@ -410,6 +411,8 @@ class Worker:
             self._pacer.speed = new.speed
             self._pacer.start(time.monotonic())
         self._cameras.watch(new.selected_env, new.cameras, new.pictures)
+        if self._task.opened is not None:
+            self._task.opened.env.watched_forces = new.watched_forces
         if (new.action_source, new.solve_all, new.selected_env) != (
             old.action_source,
             old.solve_all,

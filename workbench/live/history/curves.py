@@ -85,6 +85,7 @@ class Group(Enum):
     TERM = "reward term"
     EVALUATE = "evaluate"
     JOINT = "joint"
+    FORCE = "contact force"
 
 
 class Column(NamedTuple):
@@ -104,8 +105,14 @@ REWARD = Column(Group.REWARD, "reward")
 SUCCESS = Column(Group.EVALUATE, "success")
 
 
+def force_column(body: str, other: str) -> Column:
+    """The column of the contact force between two bodies."""
+    return Column(Group.FORCE, f"force between {body} and {other}")
+
+
 def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDArray]:
-    """(N,) values of each column that a step has: the reward, success, the reward's terms, ``evaluate``, the joints.
+    """(N,) values of each column that a step has: the reward, success, the reward's terms, ``evaluate``, the joints, watched
+    forces.
 
     Args:
         joints: names of the joints of `StepResult.qpos`.
@@ -133,7 +140,8 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
             entries[Column(Group.EVALUATE, name)] = np.broadcast_to(entry.numbers.reshape(-1), num_envs)
     moved = () if step.qpos is None else step.qpos.T
     positions = {Column(Group.JOINT, name): values for name, values in zip(joints, moved, strict=False)}
-    return {**found, **terms, **entries, **positions}
+    forces = {force_column(*pair): newtons for pair, newtons in step.forces.items()}
+    return {**found, **terms, **entries, **positions, **forces}
 
 
 def columns_by_label(step: StepResult, joints: Sequence[str] = ()) -> dict[str, Column]:
@@ -168,6 +176,9 @@ def number_of(step: StepResult, column: Column, env: int, joints: Sequence[str] 
             if step.qpos is None or name not in joints
             else float(step.qpos[env, joints.index(name)])
         )
+    if group is Group.FORCE:
+        newtons = [values[env] for pair, values in step.forces.items() if force_column(*pair) == column]
+        return float(newtons[0]) if newtons else float("nan")
     values = step.evaluate.get(TERM_PREFIX + name if group is Group.TERM else name)
     if values is not None and values.size:
         flat = values.reshape(len(step.reward), -1)

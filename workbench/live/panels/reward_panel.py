@@ -47,7 +47,7 @@ HOW_TO = (
     "(num_envs,)) into the info that compute_dense_reward receives."
 )
 BESIDE = {"its last ten episodes": "last", "the other envs": "batch"}
-AT_FIRST = (Group.REWARD, Group.TERM)
+AT_FIRST = (Group.REWARD, Group.TERM, Group.FORCE)
 """Groups that are drawn unless the user turns them off; success is drawn too."""
 Entry = tuple[Group, str]
 """Key of a choice: a column, or all parts of an entry with several numbers."""
@@ -130,6 +130,7 @@ class CurvesPanel(MomentPart):
             Group.TERM: "reward terms",
             Group.EVALUATE: "evaluate",
             Group.JOINT: "joints",
+            Group.FORCE: "contact forces",
         }
         groups = [(names[group], [entry for entry in entries if entry[0] is group]) for group in Group]
         self._choice.content = render("curve_choice", groups=groups, chosen=chosen, toggle=press)
