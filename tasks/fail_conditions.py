@@ -4,7 +4,7 @@
 
 - each reason has an entry of its own, so that a curve or a log says which of them happens;
 - success and fail are never true together: what has failed has not succeeded;
-- fail is for what cannot be mended. A hand that is only far away is no failure.
+- fail is for what cannot be fixed. A hand that is only far away is no failure.
 
 The sparse reward is +1 at success and -1 at failure, and needs no code.
 """

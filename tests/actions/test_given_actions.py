@@ -57,7 +57,7 @@ def test_what_is_no_list_of_actions_is_refused(tmp_path: Path, array: np.ndarray
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_no_robot_can_do_is_refused(tmp_path: Path, value: float) -> None:
+def test_nan_and_infinite_actions_are_refused(tmp_path: Path, value: float) -> None:
     np.save(tmp_path / "a.npy", np.array([[0.0, value]]))
     with pytest.raises(ValueError, match="NaN or infinite"):
         read_actions(tmp_path / "a.npy")

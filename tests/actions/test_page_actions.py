@@ -1,4 +1,4 @@
-"""The actions that the page chooses: sliders, and a policy that is mended while it acts."""
+"""The actions that the page chooses: sliders, and a policy that is fixed while it acts."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
 from workbench.live.process.heartbeat import Busy
 from workbench.live.view import SessionView
-from workbench.machine.kept_choices import kept_choices
+from workbench.machine.preferences import preferences
 from workbench.page.commands import (
     CloseHints,
     OpenInEditor,
@@ -92,11 +92,11 @@ def test_a_file_opens_in_the_editor_of_the_page_that_asks(live: Live) -> None:
     assert len(live.client.sent) == len(live.client.notices) == 1
 
 
-def test_closed_hints_are_gone_and_stay_away(live: Live) -> None:
+def test_closed_hints_stay_closed(live: Live) -> None:
     assert live.presses(CloseHints())
     live.do(CloseHints())
     assert not live.presses(CloseHints())
-    until(lambda: kept_choices().hints_closed, "the stored choice")
+    until(lambda: preferences().hints_closed, "the stored choice")
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,7 @@ def test_a_broken_file_is_reported_and_the_scene_stays(opened: Opened, task_file
     assert all(new is old for new, old in zip(opened.panels.bodies(""), shown, strict=True))
     task_file.write_text(good, encoding="utf-8")
     wait_until(
-        opened.session, lambda view: view.problem is None and view.task_serial > 1, "the mended version"
+        opened.session, lambda view: view.problem is None and view.task_serial > 1, "the fixed version"
     )
     opened.draw()
     assert not opened.banner()

@@ -19,7 +19,7 @@ from workbench.live.commands import Interrupt, SetSeed, Step
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest, EnterRecording, Event, Load, TaskFailed
 from workbench.live.process.supervisor import End
-from workbench.machine.kept_choices import kept_choices
+from workbench.machine.preferences import preferences
 from workbench.task.description import TaskOptions
 
 
@@ -128,7 +128,7 @@ def test_whether_saves_are_checked_is_kept_for_later_runs(tmp_path: Path) -> Non
         assert fake.view.of(ChecksView).after_each_save
         for on in (False, True):
             fake.session.do(CheckAfterSave(on=on))
-            until(lambda on=on: kept_choices().check_after_save is on, "the stored choice")
+            until(lambda on=on: preferences().check_after_save is on, "the stored choice")
             assert fake.view.of(ChecksView).after_each_save is on
     with opened(tmp_path) as (fake, _):
         assert not fake.view.of(ChecksView).after_each_save

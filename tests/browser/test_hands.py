@@ -45,8 +45,7 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Desk]:
 @pytest.fixture
 def desk(opened: Desk) -> Desk:
     """The desk, paused at the first step of an episode, with the view from the front."""
-    if opened.button("Pause").count():
-        opened.button("Pause").click()
+    opened.pause()
     opened.leave_inputs()
     opened.press("f", "Shift+R")
     opened.timeline_says("step 0 /")

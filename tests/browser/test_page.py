@@ -38,9 +38,7 @@ def at_start(desk: Desk) -> Desk:
         .or_(desk.page.locator(".wb-status").get_by_text("running", exact=True))
     ).to_be_visible()
     desk.tab("Run")
-    if desk.button("Pause").count():
-        desk.button("Pause").click()
-    expect(desk.button("Play")).to_be_visible()
+    desk.pause()
     desk.button("Reset all").click()
     return desk
 

@@ -76,7 +76,7 @@ def test_a_broken_task_breaks_its_planning_rule_and_no_other(name: str) -> None:
 @pytest.mark.slow
 def test_the_fixed_version_breaks_no_planning_rule() -> None:
     # With fewer seeds the result notes that they are too few.
-    file = str(FOLDER / "mended" / "reach_ball.py")
+    file = str(FOLDER / "fixed" / "reach_ball.py")
     results = check_rules(SOLVE_RULES, file, num_envs=4, seeds=8, render_backend="none")
     states = {rule: result.state for rule, result in results.items()}
     assert states.pop("failing-pays") == "not_applicable"  # it has no `fail`

@@ -26,7 +26,7 @@ from workbench.live.messages import Load, Settings
 from workbench.live.process.ask import Preempted
 from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied, StoppedBy
 from workbench.live.run import first_run
-from workbench.machine.kept_choices import kept_choices
+from workbench.machine.preferences import preferences
 from workbench.page.command import Refused
 from workbench.record.saving_state import SaveWanted
 from workbench.record.state import RecordingStatus
@@ -285,7 +285,7 @@ def test_turning_automatic_checks_on_is_remembered_and_checks_at_once(
         checks.session.do(CheckNow())
     for wanted in (True, False):
         checks.session.do(CheckAfterSave(on=wanted))
-        assert kept_choices().check_after_save == wanted == shown(checks).after_each_save
+        assert preferences().check_after_save == wanted == shown(checks).after_each_save
     load(checks)
     assert background.asked == []
     checks.session.do(CheckAfterSave(on=True))

@@ -17,7 +17,7 @@ from workbench.cli import page as module
 from workbench.cli.page import open_in_terminal, review_in_terminal, start_in_terminal
 from workbench.live.messages import Loaded, TaskFailed
 from workbench.live.process.supervisor import WorkerOptions
-from workbench.machine.kept_choices import KeptChoices
+from workbench.machine.preferences import Preferences
 from workbench.page.door.gated_server import ServerOptions
 from workbench.task.description import TaskOptions
 from workbench.task.problem import Problem
@@ -63,7 +63,7 @@ class Machine:
             "on_signal": self._handlers.__setitem__,
             "use_private_driver": lambda: None,
             "start_reading": lambda: self.did.append("readers"),
-            "kept_choices": lambda: KeptChoices(check_after_save=False),
+            "preferences": lambda: Preferences(check_after_save=False),
         }.items():
             monkeypatch.setattr(module, name, value)
 

@@ -91,7 +91,12 @@ def table(kinds: Sequence[type[Command]]) -> list[str]:
 
 
 def cli_page() -> str:
-    lines = ["# Commands", "", "What `workbench COMMAND --help` prints. This page is made from the code.", ""]
+    lines = [
+        "# Commands",
+        "",
+        "What `workbench COMMAND --help` prints. This page is generated from the code.",
+        "",
+    ]
     for name in CLI_COMMANDS:
         lines += [f"## {name}", "", "```text", help_of(name), "```", ""]
     return "\n".join(lines)
@@ -183,9 +188,9 @@ def all_rules_page() -> str:
     lines = [
         "# Rules",
         "",
-        "The rules of [`workbench check`](../checks.md), by the hook that a fix changes. A broken rule with the degree *stop* gives",
+        "The rules of [`workbench check`](../checks.md), grouped by the hook that a fix changes. A broken rule of degree *stop* gives",
         "the exit code 1. `workbench help RULE` shows the page of one rule. Rules of GPU simulation are also checked",
-        "[while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is made from the code.",
+        "[while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is generated from the code.",
         "",
     ]
     for hook, rules in by_hook.items():

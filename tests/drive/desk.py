@@ -23,6 +23,11 @@ class Desk:
     def tab(self, name: str) -> None:
         open_tab(self.page, name)
 
+    def pause(self) -> None:
+        """Pause, also if the page has not drawn yet that the run is paused: a click would wait for *Pause* then."""
+        self.page.evaluate("wb.ask(['pause_run', {}])")
+        expect(self.button("Play")).to_be_visible()
+
     def button(self, name: str) -> Locator:
         return self.page.get_by_role("button", name=name, exact=True)
 

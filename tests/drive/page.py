@@ -30,7 +30,7 @@ from playwright.sync_api import (
 )
 
 from tests.drive.waiting import until
-from workbench.machine.kept_choices import keep_check_after_save
+from workbench.machine.preferences import keep_check_after_save
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 """The example task; tests edit copies of it."""

@@ -19,7 +19,7 @@ from tests.drive.episodes import Made, Track
 from tests.drive.rows import append
 from tests.episodes.read_rrd import read_rrd
 from workbench.envs.camera_data import CameraInfo, CameraKind, CameraSettings, MovedCamera
-from workbench.episodes.document import seen_otherwise, write_into_description
+from workbench.episodes.document import differences_from_source, write_into_description
 from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.read_rows import read_found
@@ -210,11 +210,11 @@ def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
     info = read_episode(files.json).info
     assert info.moved_cameras == moved
     assert info.acted_by == (*episode.info.acted_by, (2, "policy"))
-    held = seen_otherwise(info)
+    held = differences_from_source(info)
     assert held["observed_by"] == "later version"
     assert [one["state"] for one in held["moved_cameras"]] == [1, 2, 3]
     plain = dataclasses.replace(info, moved_cameras=(), observed_by="")
-    assert seen_otherwise(plain) == {}
+    assert differences_from_source(plain) == {}
     assert "eye" in read_properties(files.rrd)["episode"]["moved_cameras"]
 
 

@@ -233,7 +233,7 @@ def test_driving_starts_to_play(fake: FakeWorkerSession) -> None:
     assert [one.playing for one in fake.asked(Play)] == [True]
 
 
-def test_keys_and_sticks_are_released_when_the_page_is_silent_and_not_by_an_older_report(
+def test_an_expired_timer_releases_keys_and_sticks_and_a_stale_timer_does_not(
     fake: FakeWorkerSession,
 ) -> None:
     run = fake.session.look(lambda run: run)

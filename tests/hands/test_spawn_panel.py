@@ -84,7 +84,7 @@ def test_a_dragged_handle_stays_under_the_pointer_until_its_page_lets_go(page: P
     page.spawn.drag(PAGE, "x_max", "start", np.zeros(3))
     page.show(wider)
     assert page.gizmo("x_max").position[0] == pytest.approx(0.3 + OFFSET[0])
-    page.spawn.follow()  # the page has closed
+    page.spawn.end_lost_drag()  # the page has closed
     page.show(wider)
     assert page.gizmo("x_max").position[0] == pytest.approx(0.5 + OFFSET[0])
 

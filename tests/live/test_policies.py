@@ -15,7 +15,7 @@ from workbench.live.events import FileSaved, PagesCounted
 from workbench.live.messages import Settings
 from workbench.live.policies import KnownPolicies, ListPolicies, PoliciesListed, Wanted, apply
 from workbench.live.run import first_run
-from workbench.machine.kept_choices import used_policies
+from workbench.machine.preferences import used_policies
 from workbench.task.description import TaskOptions
 
 ACT = "def act(obs):\n    pass\n"

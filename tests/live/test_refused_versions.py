@@ -39,7 +39,7 @@ def expected(good: str, session: Session) -> SessionView:
 
 
 @pytest.fixture
-def mended(good: str, expected: SessionView, session: Session, task_file: Path) -> Iterator[Session]:
+def fixed(good: str, expected: SessionView, session: Session, task_file: Path) -> Iterator[Session]:
     yield session
     save(session, task_file, good)
     found = played(session)
@@ -90,17 +90,17 @@ MISCHIEF = {
 
 @pytest.mark.parametrize("what", MISCHIEF)
 def test_effects_of_a_refused_version_are_gone(
-    mended: Session, task_file: Path, good: str, expected: SessionView, what: str
+    fixed: Session, task_file: Path, good: str, expected: SessionView, what: str
 ) -> None:
-    before = played(mended)
+    before = played(fixed)
     bad = in_evaluate(good, *MISCHIEF[what], "raise ValueError('enough')")
-    view = refused(mended, task_file, bad)
+    view = refused(fixed, task_file, bad)
     line = bad[: bad.index("raise ValueError('enough')")].count("\n") + 1
     assert view.stale and (view.problem.file, view.problem.line) == (str(task_file), line)
     # The last good version is restored at the same moment (float32 link poses, from the joints) and runs on.
     np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-5)
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
-    np.testing.assert_array_equal(step(mended).step.elapsed_steps, before.step.elapsed_steps + 1)
+    np.testing.assert_array_equal(step(fixed).step.elapsed_steps, before.step.elapsed_steps + 1)
 
 
 @pytest.mark.parametrize(
@@ -113,12 +113,12 @@ def test_effects_of_a_refused_version_are_gone(
     ids=["a setting", "a class", "a thread"],
 )
 def test_global_settings_of_a_version_disappear_with_their_line(
-    mended: Session, task_file: Path, good: str, lines: tuple[str, ...]
+    fixed: Session, task_file: Path, good: str, lines: tuple[str, ...]
 ) -> None:
-    before = save(mended, task_file, at_import(good, *lines))
-    worker = mended.worker_pid
-    view = save(mended, task_file, good)
-    assert mended.worker_pid != worker
+    before = save(fixed, task_file, at_import(good, *lines))
+    worker = fixed.worker_pid
+    view = save(fixed, task_file, good)
+    assert fixed.worker_pid != worker
     assert view.reload.level == "restarted"
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
 
@@ -131,28 +131,28 @@ LATE_FAILURES = {
 
 @pytest.mark.parametrize("what", [pytest.param("a raise", marks=pytest.mark.slow), "a default type"])
 def test_after_a_failure_at_run_time_a_reset_and_steps_equal_those_of_a_clean_process(
-    mended: Session, task_file: Path, good: str, expected: SessionView, what: str
+    fixed: Session, task_file: Path, good: str, expected: SessionView, what: str
 ) -> None:
     did, replaced = LATE_FAILURES[what]
     bad = in_evaluate(
         good, "if self.elapsed_steps.max() > 3:", f"    {did}", "    raise RuntimeError('late')"
     )
     line = bad[: bad.index("raise RuntimeError('late')")].count("\n") + 1
-    save(mended, task_file, bad)
+    save(fixed, task_file, bad)
     for go_on in (PlayRun(), Step()):
-        before, worker = played(mended), mended.worker_pid
+        before, worker = played(fixed), fixed.worker_pid
         assert before.problem is None
         np.testing.assert_array_equal(before.step.poses, expected.step.poses)
         np.testing.assert_array_equal(before.step.reward, expected.step.reward)
-        mended.do(go_on)
+        fixed.do(go_on)
         view = wait_until(
-            mended,
+            fixed,
             lambda v, n=before.task_serial: (
                 v.problem_at_run and v.state == "paused" and v.task_serial == n + replaced
             ),
             "the failure, and a pause",
         )
-        assert (mended.worker_pid != worker) is replaced is (view.spoiled != ""), view.spoiled
+        assert (fixed.worker_pid != worker) is replaced is (view.spoiled != ""), view.spoiled
         assert (view.problem.file, view.problem.line) == (str(task_file), line)
         assert not view.stale and not view.playing
         assert view.step.elapsed_steps.tolist() == [3, 3]

@@ -195,7 +195,7 @@ def test_a_saved_policy_is_loaded_and_a_fixed_one_plays_on(session: Session, tmp
     view = wait_until(session, lambda v: v.problem is not None and not v.playing, "the problem")
     assert (view.problem.stage, view.problem.file, view.problem.line) == ("policy", str(policy), 2)
     policy.write_text(text.format("0.10"))
-    view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the mended one")
+    view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the fixed one")
     assert view.problem is None
     # After a pause by the user it does not play.
     session.do(PauseRun())

@@ -265,7 +265,7 @@ def test_the_time_limit_does_not_end_a_driven_episode(fake: FakeWorkerSession, d
     assert fake.session.env_rows().failed.tolist() == [0, int(driven), 0]
 
 
-def test_an_episode_that_a_task_ends_by_a_rule_of_its_own_failed(fake: FakeWorkerSession) -> None:
+def test_an_episode_that_the_task_ends_by_its_own_rule_counts_as_failed(fake: FakeWorkerSession) -> None:
     fake.play(1)
     fake.step(evaluate={}, fail=(2,))
     fake.reset((2,))

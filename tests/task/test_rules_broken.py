@@ -277,8 +277,8 @@ def rule_ids(desk: Desk) -> list[str]:
 def test_a_row_follows_its_line_and_is_cleared_when_its_function_is_fixed(desk: Desk) -> None:
     assert rule_ids(desk) == ["not-applied", "rows-rewritten"]
     before = {row.rule: row for row in desk.rows()}
-    mended = REWRITTEN.replace("torch.rand((self.num_envs, 2))  # the fault", "None")
-    assert desk.save("\n\n    # two lines and a comment\n" + LOST + mended) == "patched"
+    fixed = REWRITTEN.replace("torch.rand((self.num_envs, 2))  # the fault", "None")
+    assert desk.save("\n\n    # two lines and a comment\n" + LOST + fixed) == "patched"
     (row,) = desk.rows()
     assert row.rule == "not-applied" and row.line == (before["not-applied"].line or 0) + 3
     assert "# the fault" in row.code

@@ -94,7 +94,7 @@ def test_the_task_chooser_stays_while_the_chosen_task_fails(
         session.do(ChooseClass(name="TwoEnv"))
         wait_until(session, lambda v: v.problem is not None and v.choices[0] == "TwoEnv", "the failure")
         file.write_text(tasks("OneEnv", "TwoEnv", broken=()))
-        view = wait_until(session, lambda v: v.task.chosen == "TwoEnv", "the mended one")
+        view = wait_until(session, lambda v: v.task.chosen == "TwoEnv", "the fixed task")
         assert view.problem is None
     finally:
         session.close()

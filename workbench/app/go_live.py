@@ -24,7 +24,7 @@ from workbench.episodes.recorded_source import (
 )
 from workbench.episodes.side_files import side_files_text
 from workbench.live.commands import PauseRun
-from workbench.live.panels.banners import is_busy_for_long
+from workbench.live.panels.banners import is_busy_for_a_long_time
 from workbench.machine.loop import BlockingPool, begin, do
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import choice
@@ -77,7 +77,7 @@ class _Transition:
         view = self.session.view()
         arrived = view.timeline.entered == self.number
         failed = view.problem_serial > self.problems or view.state == "stopped"
-        return arrived or failed or is_busy_for_long(view)
+        return arrived or failed or is_busy_for_a_long_time(view)
 
     def words(self) -> str:
         """Text for the page: what the transition waits for."""

@@ -53,8 +53,8 @@ from workbench.live.panels.timeline_panel import TimelinePanel
 from workbench.live.panels.version_panel import VersionPanel
 from workbench.live.panels.view_panel import ViewIcons, ViewPanel
 from workbench.live.view import SessionView
-from workbench.machine.kept_choices import close_hints
 from workbench.machine.loop import BlockingPool, post
+from workbench.machine.preferences import close_hints
 from workbench.page.command import Command, Refused
 from workbench.page.commands import (
     CloseDialog,

@@ -54,8 +54,8 @@ from workbench.live.process.captured_output import PrintedLine, PrintedLog
 from workbench.live.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.live.run import Run, first_run
 from workbench.live.view import SessionView, view_of
-from workbench.machine.kept_choices import keep_check_after_save
 from workbench.machine.loop import BlockingPool, ChangeCounter, do, later, on_loop, result_of, wait_for_disk
+from workbench.machine.preferences import keep_check_after_save
 from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening
 from workbench.page.command import Command
 from workbench.record.live_recorder import LiveRecorder

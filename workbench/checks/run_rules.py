@@ -33,10 +33,10 @@ from workbench.checks.rules import (
     files,
     observation,
     placement,
+    planned_reward,
     reproduce,
     reward,
     scene,
-    solved,
     source,
     step,
     visual_modes,
@@ -71,7 +71,7 @@ DECLARED: Mapping[str, tuple[RuleCheck, ...]] = {
     "observations": checks_in(observation),
     "the scene": checks_in(scene),
     "pictures": checks_in(visual_modes, cameras),
-    "planned episodes": checks_in(solved),
+    "planned episodes": checks_in(planned_reward),
 }
 """The checks of `checks.rules` by the name of their group, in the order in which they run: common mistakes first."""
 GROUPS = tuple(

@@ -110,7 +110,7 @@ class GroupChecked:
     total: int
     """Number of rules to check."""
     looks_at: str
-    """What the next group looks at."""
+    """What the next group of rules checks, as text."""
 
 
 @dataclass(frozen=True)

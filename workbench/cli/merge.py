@@ -43,7 +43,7 @@ from workbench.sweep.job import SweepOptions, collect_sweep
 
 @dataclass(frozen=True)
 class MergeOutput:
-    """Output in addition to the text. Each command that can run in parts writes some of these files; see
+    """Output in addition to the text. Each command that `--part` splits writes some of these files; see
     `_WRITES`."""
 
     json_file: Path | None = None

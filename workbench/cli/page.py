@@ -25,8 +25,8 @@ from workbench.envs.recorded_run import RUN_KEYWORDS
 from workbench.episodes.reader.reading import start_reading
 from workbench.live.messages import Event, Loaded, TaskFailed
 from workbench.live.process.supervisor import WorkerOptions
-from workbench.machine.kept_choices import kept_choices
 from workbench.machine.loop import BlockingPool, loop_in_main, on_signal
+from workbench.machine.preferences import preferences
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 from workbench.page.door.listening_socket import ServerError
@@ -206,7 +206,7 @@ class _HowToOpen:
         on_event: Callable[[Event], None],
     ) -> Session:
         callbacks = {"on_event": on_event, "on_line": print_line, "on_notice": warn}
-        check = kept_choices().check_after_save
+        check = preferences().check_after_save
         given = {"history_bytes": self.history_bytes, "worker": worker, "kept": kept, "check": check}
         session = Session(task, options, recordings=self.recordings, **given, **callbacks)
         if kept is None:

@@ -180,8 +180,7 @@ def _scopes(tree: ast.Module) -> Iterator[tuple[int, int, int]]:
 # --- the rules -------------------------------------------------------------------------------------------
 
 _WATCHED = """\
-The rule watches everything that the other checks run, and six resets of random envs with two random
-steps before each. It watches a task that is open on a page, recorded or made with `workbench.make` in
+The rule watches all other checks, and six resets of random envs, each after two random actions. It watches a task that is open on a page, recorded or made with `workbench.make` in
 the same way."""
 
 

@@ -352,7 +352,7 @@ def json_text(value: object, indent: int | None = None) -> str:
         return json.dumps(value, indent=indent, default=_plain)
 
 
-def seen_otherwise(info: EpisodeInfo) -> dict[str, Any]:
+def differences_from_source(info: EpisodeInfo) -> dict[str, Any]:
     """Fields for the metadata of an export: the cameras that were not where the recorded source places them,
     and the version that made the observations if it is later than that source. Empty if neither applies."""
     fields = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
@@ -454,11 +454,11 @@ def _require_unchanged(content: bytes, document: Document) -> None:
     if _OWN not in document.data:
         # A recording with a damaged checksum key must not pass for an old recording, which has no checksum.
         if document.is_ours and document.data["workbench"].get("format", 1) != 1:
-            raise WrongDocument("was changed since it was written: it has lost its checksum")
+            raise WrongDocument("has changed since it was written: it has lost its checksum")
     elif document.data[_OWN] is not None:
         before, comma, _ = content.rpartition(b',\n  "%s"' % _OWN.encode())
         if not comma or with_checksum(before + b"}") != content.rstrip():
-            raise WrongDocument("was changed since it was written: its checksum differs")
+            raise WrongDocument("has changed since it was written: its checksum differs")
 
 
 def checksum(path: Path) -> Checksum:

@@ -255,7 +255,7 @@ class HandsPanel(PagePart[SessionView]):
     def follow(self, view: SessionView) -> None:
         """Let go if the page that drags has closed, if the pulled env was reset, or if a body that is being moved plays or
         another moment is shown."""
-        self.spawn.follow()
+        self.spawn.end_lost_drag()
         drag = self._drag
         if drag is None:
             return

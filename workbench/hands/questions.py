@@ -16,14 +16,14 @@ from workbench.source.parsed import Place, TracedValue
 
 @dataclass(frozen=True, eq=False)
 class Operand:
-    """A number, or one for each drawn column, that the drawn numbers are combined with."""
+    """A number, or one for each sampled column, that an operator combines with the sampled numbers."""
 
     at: Place
     """The expression where the operand is used."""
     numbers: tuple[float, ...]
     """Its value; empty if it is not known."""
     value: TracedValue | None
-    """None if it could not be followed to where it is written."""
+    """None if it could not be traced to the source."""
     why: str = ""
     """Reason why `value` is None."""
 

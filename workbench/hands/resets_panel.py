@@ -167,19 +167,19 @@ class ResetsPanel(PagePart[SessionView]):
         known: Selected,
         poses: NDArray[np.float32],
         colours: NDArray[np.uint8],
-        there: NDArray[np.bool_],
+        present: NDArray[np.bool_],
     ) -> None:
-        """Draw the body's shape at its poses (S, N, 7), in the colours (S, N, 3), of the resets in `there` (S, N)."""
-        every = np.flatnonzero(there)
-        chosen = np.zeros(there.size, bool)
+        """Draw the body at `poses` (S, N, 7) in `colours` (S, N, 3) where the mask `present` (S, N) is true."""
+        every = np.flatnonzero(present)
+        chosen = np.zeros(present.size, bool)
         chosen[every[np.linspace(0, len(every) - 1, min(len(every), MAX_GHOSTS)).astype(int)]] = True
-        there = chosen.reshape(there.shape)
+        present = chosen.reshape(present.shape)
         own = [visual for visual in geometry.visuals if (visual.bodies == known.row).any()][:MAX_PARTS]
         limit = max(MIN_FACES, MAX_GHOST_FACES // max(1, len(own) * MAX_GHOSTS))
         for number, visual in enumerate(own):
             # Another env may have another shape.
             envs = np.isin(np.arange(poses.shape[1]), visual.envs[visual.bodies == known.row])
-            shown = there & envs
+            shown = present & envs
             if not shown.any() or not len(visual.mesh.faces):
                 continue
             mesh = reduce_mesh(visual.mesh, limit)

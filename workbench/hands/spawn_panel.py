@@ -153,8 +153,8 @@ class SpawnPanel:
         axis = AXES.index(side[0])
         self._session.dispatch(SpawnDragged(side, float(position[axis] - drag.offset[axis])))
 
-    def follow(self) -> None:
-        """Let go if the page that drags has closed, or if the handle is hidden: neither reports an end."""
+    def end_lost_drag(self) -> None:
+        """End the drag if its page has closed or the handle is hidden: neither reports an end."""
         drag = self._drag
         if drag is None:
             return

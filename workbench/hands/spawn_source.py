@@ -284,12 +284,12 @@ class _Expression:
         else:
             self._solve(slopes, offsets)
         if not all(np.isfinite(new).all() for new in self._new.values()):
-            raise RefusedEdit(f"{_where(self._changes, self._draw.whole)} multiplies a drawn number by 0")
+            raise RefusedEdit(f"{_where(self._changes, self._draw.whole)} multiplies a sampled number by 0")
         for operands in self._by_place():
             self._write(operands)
 
     def _needs_columns(self, low: Floats, high: Floats) -> bool:
-        """Whether ``(high - low) + low`` has one number where each column needs its own."""
+        """Whether ``rand * (high - low) + low`` has one number where each column needs its own."""
         one = any(len(bound.numbers) == 1 for bound in self._draw.bounds)
         return len(self._draw.bounds) == 3 and one and not (_same(low, low[:1]) and _same(high, high[:1]))
 

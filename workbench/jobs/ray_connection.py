@@ -61,7 +61,7 @@ class ClusterHealth:
         if not self._head or now - self._probed_at < _PROBE_SECONDS:
             return
         self._probed_at = now
-        why = _why_deaf(self._head)
+        why = _why_unreachable(self._head)
         if why is None:
             self._answered_at = now
         elif now - self._answered_at > _HEAD_DOWN_SECONDS:
@@ -92,7 +92,7 @@ def connected(address: str = AUTO) -> Iterator[Any]:
         return
     if address == AUTO:
         address = os.environ.get("RAY_ADDRESS") or _left_here() or LOCAL
-    if address != LOCAL and (why := _why_deaf(address)) is not None:
+    if address != LOCAL and (why := _why_unreachable(address)) is not None:
         raise NoCluster(_no_cluster_text(address, why))
     how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
     with ExitStack() as kept:
@@ -138,8 +138,8 @@ def _asks_for_token(ray: Any, address: str) -> bool:
     return False
 
 
-def _why_deaf(address: str) -> str | None:
-    """Why no cluster can be at the address; None if something listens there. Ray itself would retry for
+def _why_unreachable(address: str) -> str | None:
+    """Why nothing accepts connections at the address; None if something does. Ray itself would retry for
     minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
@@ -164,7 +164,7 @@ def _left_here() -> str | None:
 
     # Ray keeps the address of a cluster that has ended, and would try to connect for minutes.
     address = find_bootstrap_address(None)
-    return address if address and _why_deaf(address) is None else None
+    return address if address and _why_unreachable(address) is None else None
 
 
 def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:

@@ -45,7 +45,7 @@ class LibraryIndex:
     """The index of one folder. Thread-safe; its methods do not fail.
 
     All its content can be read again from the files. So a broken index is deleted, and an operation that
-    finds the index locked for `LOCKED_SECONDS` is skipped. SQLite survives concurrent processes and kills.
+    finds the index locked for `LOCKED_SECONDS` is skipped. SQLite tolerates concurrent processes, and processes that are killed.
 
     The index is in the user's cache folder, or in memory if that folder is not writable. It is not in the
     library's folder: a foreign folder could contain an index that is a link to another program's database, or

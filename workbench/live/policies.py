@@ -12,8 +12,8 @@ from pathlib import Path
 from workbench.actions.policy import NoPolicy, find_policy, list_policies
 from workbench.live.process.background_jobs import Job, Jobs
 from workbench.live.run import Run
-from workbench.machine.kept_choices import keep_policy, used_policies
 from workbench.machine.loop import BlockingPool, do
+from workbench.machine.preferences import keep_policy, used_policies
 
 LIST_SECONDS = 5.0
 """Interval between searches for policies. A search reads many files."""

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from workbench.envs.scene.mesh_levels import are_known, deviation, from_afar, levels_of, reduced_mesh, within
+from workbench.envs.scene.mesh_levels import (
+    are_known,
+    cached_reduced_mesh,
+    deviation,
+    from_afar,
+    levels_of,
+    within,
+)
 from workbench.envs.scene.shapes import Mesh
 
 
@@ -21,7 +28,7 @@ def test_a_reduced_mesh_is_cached_and_a_corrupt_file_is_replaced(
     mesh = Mesh(
         sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32), sphere.vertices.astype(np.float32)
     )
-    reduced = reduced_mesh(mesh, 400)
+    reduced = cached_reduced_mesh(mesh, 400)
     assert 200 < len(reduced.faces) <= 800
     assert np.abs(np.linalg.norm(reduced.vertices, axis=1) - 1).max() < 0.05
     assert reduced.normals is not None
@@ -30,11 +37,11 @@ def test_a_reduced_mesh_is_cached_and_a_corrupt_file_is_replaced(
     written = file.read_bytes()
     for content in (written, b"no file of ours", b""):
         file.write_bytes(content)
-        again = reduced_mesh(mesh, 400)
+        again = cached_reduced_mesh(mesh, 400)
         np.testing.assert_array_equal(again.vertices, reduced.vertices)
         np.testing.assert_array_equal(again.faces, reduced.faces)
         np.testing.assert_array_equal(again.normals, reduced.normals)
-    assert reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
+    assert cached_reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
 
 
 def test_a_distant_mesh_has_few_triangles_near_the_surface_and_is_cached(

@@ -76,7 +76,7 @@ def test_linear_colours_are_encoded_and_transparency_is_not() -> None:
     )
 
 
-def test_a_scene_names_what_is_hidden_and_shows_its_collision_shapes() -> None:
+def test_a_scene_lists_hidden_bodies_and_collision_shapes() -> None:
     geometry, _ = table_scene(2)
     collisions = (visual(*looks()["first"], name="hull/0"),)
     made = replace(geometry, body_hidden=(False, True, False, True), collisions=collisions)

@@ -77,7 +77,7 @@ def test_the_log_contains_no_control_character(pieces: list[bytes]) -> None:
     assert not [c for c in text if unicodedata.category(c) == "Cc" and c != "\t"]
 
 
-def test_a_style_lasts_over_lines_of_its_stream_until_the_stream_ends() -> None:
+def test_an_ansi_style_carries_over_lines_until_its_stream_ends() -> None:
     log, reported = a_log()
     log.feed("stdout", b"\x1b[31mred\nstill\n")
     log.feed("stderr", b"plain\n")

@@ -227,8 +227,8 @@ def test_an_interrupt_stops_work_but_no_idle_or_debugged_worker() -> None:
         one.worker.send(do("held_by_a_debugger 1.5"))
         one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "the debugger")
         one.worker.interrupt()
-        one.worker.send(load("mended"))
-        one.until(lambda: "mended" in one.activities, "the load by the same worker")
+        one.worker.send(load("fixed"))
+        one.until(lambda: "fixed" in one.activities, "the load by the same worker")
         one.until(lambda: one.busy[-1] is None, "the end of the debugger")
         assert "interrupted" not in one.activities and one.deaths == []
         one.worker.send(do("work 600"))
@@ -252,9 +252,9 @@ def test_a_load_waits_only_for_short_work() -> None:
         one.worker.send(do("work 600"))
         one.until_busy()
         assert not one.worker.load_pending
-        one.worker.send(load("mended"))
+        one.worker.send(load("fixed"))
         assert one.worker.load_pending
-        one.until(lambda: "mended" in one.activities, "the load")
+        one.until(lambda: "fixed" in one.activities, "the load")
         assert "interrupted" in one.activities and one.deaths == []
         one.until(lambda: not one.worker.load_pending, "the start of the load")
 
@@ -288,7 +288,7 @@ def test_a_load_behind_uninterruptible_work_ends_the_worker() -> None:
             one.until_greeted(times)
             one.worker.send(do("work_on 600"))
             one.until_busy()
-            one.worker.send(load("mended"))
+            one.worker.send(load("fixed"))
             death = one.until_dead(times)
             assert death.end is End.FILE_WAITS and not death.gives_up, "it was not the worker's fault"
             # Only after the interrupt had its time: sent after 0.3 s, and 1.2 s to work.

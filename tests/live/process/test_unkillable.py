@@ -309,7 +309,7 @@ def test_a_file_that_never_loaded_costs_one_worker_until_the_next_save(tmp_path:
     waiting = session.worker_pid
     calm(file)
     edit(file)
-    wait_until(session, lambda v: v.task is not None and v.problem is None, "the mended file")
+    wait_until(session, lambda v: v.task is not None and v.problem is None, "the fixed file")
     assert session.worker_pid == waiting
     session.close()
     assert not psutil.pid_exists(waiting)

@@ -19,7 +19,7 @@ from tests.live.debug_client import DebugClient
 from workbench.app.session import Session
 from workbench.app.status_line import status_values
 from workbench.live.commands import Interrupt, RestartWorker, Step
-from workbench.live.panels.banners import is_busy_for_long
+from workbench.live.panels.banners import is_busy_for_a_long_time
 from workbench.live.process import supervisor
 from workbench.live.process.supervisor import WorkerOptions
 from workbench.live.view import SessionView
@@ -95,7 +95,7 @@ def test_a_debugger_can_pause_the_worker_for_any_time(session: Session, task_fil
     held_since = time.monotonic()
     view = wait_until(session, lambda v: bool(v.busy and v.busy.seconds > 6 * HANG_SECONDS), "a long time")
     session.do(Interrupt())
-    assert view.stale and not is_busy_for_long(view) and view.problem is None
+    assert view.stale and not is_busy_for_a_long_time(view) and view.problem is None
     assert session.worker_pid == worker and time.monotonic() - held_since > 4 * HANG_SECONDS
     client.stop_at(task_file)
     client.ask("continue", threadId=thread)

@@ -49,7 +49,7 @@ class CameraEdit(Changes):
             )
         file, node = self.find(run.trace.at)
         if not isinstance(node, ast.Call):
-            raise RefusedEdit(f"the camera {uid!r} is not made by a call")
+            raise RefusedEdit(f"the camera {uid!r} is not made by a call of CameraConfig")
         return CameraCall(file, node, key, arguments(node, PARAMETERS), run, run.trace)
 
     def verified(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:

@@ -254,7 +254,7 @@ def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float
         yaw = math.atan2(m[1, 0], m[0, 0])
         candidates = [(roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi)]
     else:
-        # If the camera looks along z, only the sum or difference of roll and yaw matters: keep yaw.
+        # Gimbal lock: the camera looks along z, and only the sum or difference of roll and yaw is defined. Keep yaw.
         pitch = math.copysign(math.pi / 2, -m[2, 0])
         whole = math.atan2(m[0, 1], m[1, 1]) if pitch > 0 else math.atan2(-m[0, 1], m[1, 1])
         candidates = [(whole + near[2] if pitch > 0 else whole - near[2], pitch, near[2])]

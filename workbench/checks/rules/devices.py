@@ -58,8 +58,8 @@ def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:
 
 @rule("device-copies", "warn", "evaluate")
 def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
-    """Hooks that run at every step leave tensors on their device: no .cpu(), .item(), float(tensor) or if
-    tensor:.
+    """Hooks that run at every step leave tensors on their device: no `.cpu()`, `.item()`,
+    `float(tensor)` or `if tensor:`.
 
     The GPU has to stop for each copy, in every step.
 

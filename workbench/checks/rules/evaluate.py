@@ -86,7 +86,7 @@ def see_success_stays_possible(checkup: Checkup) -> Iterator[Seen]:
 
 @rule("success-stays-possible", "warn", "evaluate", see=see_success_stays_possible)
 def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """evaluate() has an entry success (or fail) if the reward is sparse.
+    """`evaluate()` has an entry `success` (or `fail`) if the reward is sparse.
 
     The sparse reward is made of success and fail: without them it is always 0.
 
@@ -219,7 +219,7 @@ def see_success_and_fail(checkup: Checkup) -> Iterator[Seen]:
 
 @rule("success-and-fail", "warn", "evaluate", see=see_success_and_fail)
 def success_and_fail(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """success and fail are never true together.
+    """`success` and `fail` are never true together.
 
     An episode counts as a success and as a failure.
 
@@ -282,9 +282,9 @@ def see_success_flickers(checkup: Checkup) -> Iterator[Seen]:
 
 @rule("success-flickers", "warn", "evaluate", see=see_success_flickers)
 def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """success holds for some steps once it is true.
+    """`success` stays true for several steps once it is true.
 
-    Whether an episode counts depends on the step at which success is read.
+    Whether an episode counts depends on the step at which `success` is read.
 
     ## Why
     Evaluation counts success at the last step or at any step, and the two differ if success comes and goes.

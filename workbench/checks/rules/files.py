@@ -103,7 +103,7 @@ def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
 def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
     """Assets that need a download are named in asset_download_ids.
 
-    ManiSkill asks for the download at a prompt, which a cluster does not have, or the build fails because the
+    ManiSkill asks for the download at a prompt that nobody answers on a cluster, or the build fails because the
     files are missing.
 
     ## Why
@@ -119,10 +119,10 @@ def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule reads the source of the hooks and of the functions that they call, and looks for paths below
-    ManiSkill's folder of downloads and for ids such as `ycb:024_bowl`. It leaves out what stands in a branch
-    of an `if`, since the task may work without it. It does not see downloads that one of ManiSkill's scene
-    builders uses, or that a robot needs.
+    The rule reads the source of the hooks and of the functions that they call, and looks for paths in
+    ManiSkill's download folder and for ids such as `ycb:024_bowl`. It skips code inside an `if`, since the
+    task may work without it. It does not see downloads that one of ManiSkill's scene builders uses, or that a
+    robot needs.
     """
     env_id = checkup.loaded.env_id
     declared = set(checkup.loaded.asset_ids)

@@ -218,7 +218,7 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     Trainers reset the envs whose episodes are over, and only those: `env_idx` has fewer rows than
-    `self.num_envs`. A tensor of `self.num_envs` rows does not fit there and raises, or replaces what the task
+    `self.num_envs`. A tensor of `self.num_envs` rows causes a shape error, or overwrites what the task
     keeps for envs that are in the middle of an episode.
 
     ## Fix

@@ -125,7 +125,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
         drawn = drawn or first_draw(checkup.places, torch_draw, *_RESULT_HOOKS)
         place, called = drawn or (checkup.places.hook("_initialize_episode"), "")
         yield Found(
-            f"{_named(differing)} after two resets with the same seeds. "
+            f"{_differences_text(differing)} after two resets with the same seeds. "
             + (
                 f"{called} is not seeded by the reset: draw"
                 if called
@@ -164,9 +164,10 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule resets at most four seeds, keeps the state, resets other seeds, and sets the state. `evaluate()`,
-    the reward for an action of zeros and the observation must be as before, to 0.001. The rule ignores the robot's own sensors. It also ignores every number that already changes when only the
-    simulation's state is set to another state and back, without a reset (velocities of links, noise). It makes no step, because no state contains the contacts. So it does not notice counters that change only in
-    a step.
+    the reward for an action of zeros and the observation must be as before, to 0.001. The rule ignores the
+    robot's own sensors. It also ignores every number that already changes when only the simulation's state is
+    set to another state and back, without a reset (velocities of links, noise). It makes no step, because no
+    state contains the contacts. So it does not notice counters that change only in a step.
     """
     seeds = next(checkup.batches())[: min(4, checkup.num_envs)]
     others = [seed + 5000 for seed in seeds]
@@ -193,7 +194,7 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
     lost = {name: by for name, by in differing.items() if name not in noisy}
     if lost:
         yield Found(
-            f"{_named(lost)} after get_state_dict() and set_state_dict(). Keep what decides these values in a body (a "
+            f"{_differences_text(lost)} after get_state_dict() and set_state_dict(). Keep what decides these values in a body (a "
             "kinematic goal that has a pose), or add it to the state in get_state_dict and set_state_dict.",
             checkup.places.hook("get_state_dict", "_initialize_episode"),
         )
@@ -248,7 +249,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
             ),
         )
         yield Found(
-            f"{_named(differing)} after {step} {'step' if step == 1 else 'steps'} of the same actions from the same seeds. "
+            f"{_differences_text(differing)} after {step} {'step' if step == 1 else 'steps'} of the same actions from the same seeds. "
             f"{drawn[1]} does not depend on the seed: draw from self._batched_episode_rng, or in the reset.",
             drawn[0],
         )
@@ -364,8 +365,8 @@ def _differing(one: Numbers, other: Numbers, tolerance: float) -> dict[str, floa
     return dict(sorted(found.items()))
 
 
-def _named(differing: Mapping[str, float]) -> str:
-    """``actors/cube (by 0.05), the reward (by 1) differ``."""
+def _differences_text(differing: Mapping[str, float]) -> str:
+    """Text such as ``actors/cube (by 0.05), the reward (by 1) differ``."""
     names = [f"{name} (by {by:.2g})" for name, by in differing.items()]
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return f"{', '.join(names[:3])}{more} {'differs' if len(names) == 1 else 'differ'}"

@@ -103,7 +103,7 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
     unposed: dict[Place | None, list[str]] = {}
     own = [*_own(checkup)]
     if not own:
-        raise NotApplicable("the author's files build no body")
+        raise NotApplicable("your files build no body")
     for each in own:
         if _is_unposed(checkup, each) and each.collision:
             unposed.setdefault(each.place, []).append(each.name)
@@ -428,7 +428,7 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
     Pictures are slow, and the mesh takes memory of the GPU renderer.
 
     ## Why
-    A mesh from a scanner or a CAD program may have millions of triangles. Each picture of each env draws
+    A mesh from a scanner or a CAD program may have millions of triangles. Every render of every env draws
     them, and a renderer on the GPU keeps them in memory. A picture of 128 x 128 pixels shows none of that
     detail.
 
@@ -443,7 +443,7 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule counts the triangles of each file that a body of the author's files is drawn with, and reports
+    The rule counts the triangles of each mesh file that draws a body of the author's files, and reports
     more than 100,000. It does not read files that are too small to have so many. Robots are left out.
     """
     files = _mesh_files(checkup, "file")

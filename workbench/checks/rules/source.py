@@ -401,10 +401,10 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
     The task runs on one of CPU and GPU, and fails on the other.
 
     ## Why
-    Often a task is written on the CPU and trained on the GPU, or trained on one and evaluated on the other. `get_contacts()`
-    and the state of a single SAPIEN object exist, or are up to date, in the CPU simulation only; `px.gpu_...`
-    and `_gpu_apply_all()` exist in the GPU simulation only. The task runs on one of them, and on the other it
-    raises or reads old state.
+    Often a task is written on the CPU and trained on the GPU, or trained on one and evaluated on the other.
+    `get_contacts()` and the state of a single SAPIEN object exist, or are up to date, in the CPU simulation
+    only; `px.gpu_...` and `_gpu_apply_all()` exist in the GPU simulation only. The task runs on one of them,
+    and on the other it raises or reads old state.
 
     ## Fix
     Use ManiSkill's batched calls, or put the call behind the condition.

@@ -56,12 +56,12 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    Two envs observe pictures. The rule moves each dynamic body and each articulation that is not a robot (40 at
-    most) by a few centimetres without a step, and calls `_get_obs_extra` again: a number that changes follows
-    the body. Goals (kinematic and hidden bodies) may be in the observation. Contacts and forces do not change
-    without a step, so `is_grasping` is no finding. The result is *not known* if there is no renderer, and
-    *not applicable* for a task that has no observation mode with pictures, or in which nothing but the robot
-    moves freely.
+    The rule runs two envs that observe pictures. The rule moves each dynamic body and each articulation that
+    is not a robot (40 at most) by a few centimetres without a step, and calls `_get_obs_extra` again: a
+    number that changes follows the body. Goals (kinematic and hidden bodies) may be in the observation.
+    Contacts and forces do not change without a step, so `is_grasping` is not reported. The result is *not
+    known* if there is no renderer, and *not applicable* for a task that has no observation mode with
+    pictures, or in which nothing but the robot moves freely.
     """
     bodies_of: dict[str, list[str]] = {}
     seen = {body: moved for body, moved in checkup.look(followers).items() if not moved.hidden}
@@ -104,10 +104,10 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    Two envs observe pictures. The rule moves each body of `_hidden_objects` by a few centimetres. It reports a
-    body if nothing of `_get_obs_extra` changes, although an entry of `evaluate()` or the dense reward does.
-    The result is *not applicable* without hidden bodies. The rule does not see a goal that the task keeps in
-    a tensor.
+    The rule runs two envs that observe pictures. The rule moves each body of `_hidden_objects` by a few
+    centimetres. It reports a body if nothing in `_get_obs_extra` changes, although an entry of `evaluate()`
+    or the dense reward does. The result is *not applicable* without hidden bodies. The rule does not see a
+    goal that the task keeps in a tensor.
     """
     bodies = {body: moved for body, moved in checkup.look(followers).items() if moved.hidden}
     if not bodies:

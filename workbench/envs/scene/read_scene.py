@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workbench.envs import maniskill_private
-from workbench.envs.scene.mesh_levels import reduced_mesh
+from workbench.envs.scene.mesh_levels import cached_reduced_mesh
 from workbench.envs.scene.normals import with_normals
 from workbench.envs.scene.scene_index import SceneIndex, scene_index
 from workbench.envs.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
@@ -291,7 +291,7 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
     if flat is not None:
         mesh = flat
     else:
-        mesh = share_vertices(mesh) if len(mesh.faces) <= max_faces else reduced_mesh(mesh, max_faces)
+        mesh = share_vertices(mesh) if len(mesh.faces) <= max_faces else cached_reduced_mesh(mesh, max_faces)
     if source.keep:
         _kept_meshes[key] = mesh
         if len(_kept_meshes) > _MAX_KEPT_MESHES:

@@ -103,7 +103,7 @@ class SceneGeometry:
 
 
 def fingerprint(visuals: tuple[Visual, ...]) -> str:
-    """Digest that is equal for visuals that look the same, also after another load."""
+    """Digest that is equal for visuals that look the same, even across loads."""
     digest = hashlib.blake2b(digest_size=16)
     for visual in visuals:
         mesh, material = visual.mesh, visual.material

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from workbench.episodes.document import seen_otherwise
+from workbench.episodes.document import differences_from_source
 from workbench.episodes.episode import Episode, read_whole
 from workbench.episodes.films import Encoding, FilmWriter
 from workbench.episodes.lerobot import format as form
@@ -236,7 +236,7 @@ class _Writer:
                 "task": info.task,
                 "seed": info.seed,
                 "source_hash": info.source_hash,
-                **seen_otherwise(info),
+                **differences_from_source(info),
             }
         )
         self._made.episodes += 1

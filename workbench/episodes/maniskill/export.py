@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from workbench.episodes.document import json_text, seen_otherwise
+from workbench.episodes.document import differences_from_source, json_text
 from workbench.episodes.episode import Episode, read_whole
 from workbench.episodes.maniskill.sensors import missing_pictures, observed_pictures, put_pictures
 from workbench.episodes.maniskill.write import maniskill_json, put_columns
@@ -142,7 +142,7 @@ def _write_episodes(
                 **entry["episodes"][0],
                 "episode_id": made.episodes,
                 WORKBENCH_ID: episode.info.id,
-                **seen_otherwise(episode.info),
+                **differences_from_source(episode.info),
             }
         )
         made.episodes, made.steps = made.episodes + 1, made.steps + episode.length

@@ -124,7 +124,7 @@ class H5Group:
         """All numbers of a dataset. Raises KeyError if there is none, and RefusedH5."""
         found = self[path]
         if not isinstance(found, H5Dataset):
-            raise KeyError(f"{path} is a group, not numbers")
+            raise KeyError(f"{path} is a group, not a dataset")
         return found.read()
 
     def _follow(self, path: str, links: int) -> H5Group | H5Dataset | None:

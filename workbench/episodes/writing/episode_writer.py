@@ -261,7 +261,7 @@ class EpisodeWriter:
         arrays = _arrays_of(picture)
         given = tuple(arrays)
         for modality, pixels in arrays.items():
-            self._check_numbers(info.name, modality, pixels)
+            self._check_pixels(info.name, modality, pixels)
             shape = pixels.shape
             if shape[:2] != (info.height, info.width):
                 raise ValueError(
@@ -277,12 +277,12 @@ class EpisodeWriter:
         return index
 
     @staticmethod
-    def _check_numbers(camera: str, modality: Modality, pixels: NDArray) -> None:
+    def _check_pixels(camera: str, modality: Modality, pixels: NDArray) -> None:
         """Check dtype and shape now: the encoder would fail later, when the step is unknown."""
         shape, kinds, what = _PIXELS[modality]
         if pixels.dtype.kind not in kinds or pixels.shape[2:] != shape or (shape and pixels.itemsize != 1):
             raise ValueError(
-                f"camera {camera} gave a {modality} picture {pixels.shape} of {pixels.dtype}, not {what}."
+                f"camera {camera} gave a picture ({modality}) of shape {pixels.shape} and dtype {pixels.dtype}, not {what}."
             )
 
     def _failed(self, error: OSError) -> RecordingError:

@@ -60,7 +60,7 @@ INTERRUPTED = {
 }
 
 
-def is_busy_for_long(view: SessionView) -> bool:
+def is_busy_for_a_long_time(view: SessionView) -> bool:
     """Whether to show the busy banner, which hides the problem banner.
 
     The busy banner is hidden while a worker starts: none of the author's code runs then, and the reason why
@@ -77,7 +77,7 @@ class Banner(PagePart[SessionView]):
 
     Args:
         server: The page.
-        link: Links the line in the file.
+        link: Makes the link to a source line.
         is_own: Returns whether the banner may write this file: it is the task's file, and was named by the
             user, not by a recording.
     """
@@ -107,7 +107,7 @@ class Banner(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         problem = view.problem
-        if problem is None or is_busy_for_long(view):
+        if problem is None or is_busy_for_a_long_time(view):
             if self._panel.visible:
                 self._panel.visible = False
             self._drawn = self._blank = None
@@ -197,16 +197,16 @@ def _kept(view: SessionView) -> str:
 
 
 class BusyBanner(PagePart[SessionView]):
-    """A floating panel that is shown while the worker is busy for long: hook, line and seconds.
+    """A floating panel that is shown while the worker is busy for a long time, with the hook, line and seconds.
 
-    The code may only be slow, so nothing is done automatically. *Interrupt* raises an exception in the
-    author's code, and keeps process and envs. If that does not help (native code, a loop that catches
+    The code may just be slow, so nothing is done automatically. *Interrupt* raises an exception in the
+    author's code, and keeps the process and the envs. If that does not help (native code, a loop that catches
     everything), *Restart* ends the process. A new process loads the file as it is now; if the old process was
     loading the file, the new one restores the last good version instead.
 
     Args:
         server: The page.
-        link: Links the line in the file.
+        link: Makes the link to a source line.
     """
 
     def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
@@ -220,7 +220,7 @@ class BusyBanner(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         busy = view.busy
-        if busy is None or not is_busy_for_long(view):
+        if busy is None or not is_busy_for_a_long_time(view):
             self._panel.visible = False
             return
         self._html.content = busy_html(busy, view, self._link)

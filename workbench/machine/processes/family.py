@@ -60,9 +60,9 @@ def allocated_memory(pid: int) -> int:
 
 
 def proportional_memory(pids: Iterable[int]) -> int:
-    """Bytes that these processes have in memory together (PSS): a memory page that they share counts once.
+    """Total memory of these processes in bytes (PSS); shared pages count once.
 
-    Takes milliseconds for each process of a gigabyte.
+    Takes milliseconds for a process of 1 GB.
     """
     return sum(map(_proportional, pids))
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import viser
 
-from workbench.machine.kept_choices import kept_choices
+from workbench.machine.preferences import preferences
 from workbench.page.command import KEY_NAMES, SHORT_NAMES, Command, CommandList, key_in_words
 from workbench.page.commands import CloseHints, ShowTab
 from workbench.page.door.viser_private import places
@@ -89,4 +89,4 @@ def add(
 
 def add_hints(server: viser.ViserServer) -> viser.GuiHtmlHandle:
     """Add four hints to the present container, unless the user has closed them for good."""
-    return server.gui.add_html("" if kept_choices().hints_closed else render("hints", close=CloseHints()))
+    return server.gui.add_html("" if preferences().hints_closed else render("hints", close=CloseHints()))

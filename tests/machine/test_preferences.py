@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 
 from workbench.machine.folders import read_private, user_folder, write_private
-from workbench.machine.kept_choices import (
+from workbench.machine.preferences import (
     FILE,
     MAX_FOLDERS,
     MAX_POLICIES,
-    KeptChoices,
+    Preferences,
     close_hints,
     keep_check_after_save,
     keep_policy,
-    kept_choices,
+    preferences,
     used_policies,
 )
 
@@ -39,7 +39,7 @@ def test_stored_choices_are_bounded() -> None:
         keep_policy(Path(f"/{number}"), "a.py:act")
     for number in range(MAX_POLICIES + 5):
         keep_policy(Path("/last"), f"{number}.py:act")
-    kept = kept_choices().policies
+    kept = preferences().policies
     assert len(kept) == MAX_FOLDERS and "/0" not in kept
     assert len(kept["/last"]) == MAX_POLICIES and kept["/last"][0] == f"{MAX_POLICIES + 4}.py:act"
 
@@ -49,10 +49,10 @@ def test_a_corrupt_file_gives_defaults_and_is_logged(
     content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_private(FILE, content)
-    assert not kept_choices().hints_closed
+    assert not preferences().hints_closed
     assert "Stored choices cannot be read" in caplog.text
     close_hints()
-    assert kept_choices().hints_closed
+    assert preferences().hints_closed
 
 
 def test_a_failed_write_is_logged_and_not_raised(caplog: pytest.LogCaptureFixture) -> None:
@@ -66,9 +66,9 @@ def test_a_failed_write_is_logged_and_not_raised(caplog: pytest.LogCaptureFixtur
 
 
 def test_each_choice_is_stored_and_keeps_the_others() -> None:
-    assert kept_choices() == KeptChoices(hints_closed=False, check_after_save=True, policies={})
+    assert preferences() == Preferences(hints_closed=False, check_after_save=True, policies={})
     keep_policy(Path("/lab"), "a.py:act")
     close_hints()
     for wanted in (False, True, False):
         keep_check_after_save(wanted)
-        assert kept_choices() == KeptChoices(True, wanted, {"/lab": ["a.py:act"]})
+        assert preferences() == Preferences(True, wanted, {"/lab": ["a.py:act"]})

@@ -15,7 +15,7 @@ from workbench.checks.evidence.collect import Checkup
 from workbench.checks.job_items import CheckOptions, count_rules, degrees_of_request
 from workbench.checks.results import RuleResult
 from workbench.checks.rule_table import SOLVE_RULES, degree_of_each
-from workbench.checks.rules.solved import solved_episodes
+from workbench.checks.rules.planned_reward import solved_episodes
 from workbench.planning.planned_episodes import PlannedEpisode
 from workbench.planning.rollouts import Plan
 from workbench.planning.verdicts import MIN_EPISODES, MIN_SEEDS, VERDICTS, PlannedEpisodes
@@ -134,7 +134,7 @@ class Planner:
 def test_an_episode_goes_on_a_little_after_its_success_and_ends_at_its_fail(
     entry: str, steps: int, example: Checkup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.checks.rules.solved.Planner", Planner)
+    monkeypatch.setattr("workbench.checks.rules.planned_reward.Planner", Planner)
     cls = example.loaded.cls
     stock = cls.evaluate
     monkeypatch.setattr(cls, "evaluate", lambda env: {**stock(env), entry: env.elapsed_steps >= 3})

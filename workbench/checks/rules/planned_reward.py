@@ -42,8 +42,8 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     training ends there: the curve of the return looks perfect, and the success rate stays at 0.
 
     ## Fix
-    Look at the episodes that the finding names, and let the reward pay for what `evaluate` checks. A cube
-    that is held above the target is near it in x and y only.
+    Look at the episodes that the finding names, and let the reward pay for what `evaluate` checks. For
+    example, a cube held above the target is near it in x and y only.
 
     ```python fragment
     at_goal = torch.linalg.norm(self.cube.pose.p - self.goal.pose.p, dim=1)  # in x, y and z
@@ -55,7 +55,7 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
     reward. The rule reports an unsolved episode if the mean reward of its last steps (at most ten) is at
     least the median reward of the steps at which solved episodes succeed. It finds nothing if no seed is
-    solved, since nothing then says what success pays.
+    solved, since what success pays is then unknown.
     """
     episodes = checkup.look(solved_episodes)
     solved = [one.solved_at for one in episodes.solved]
@@ -98,7 +98,7 @@ def reward_flat(checkup: Checkup) -> Iterator[Found | Note]:
 
 @rule("reward-stuck", "warn", "compute_dense_reward", solve=True)
 def reward_stuck(checkup: Checkup) -> Iterator[Found | Note]:
-    """While the task is unsolved, some actions earn more than the episode earns already.
+    """While the task is unsolved, some actions earn more than the episode earned so far.
 
     A policy learns to stop there: the way to success costs reward first.
 
@@ -185,8 +185,8 @@ def failing_pays(checkup: Checkup) -> Iterator[Found | Note]:
     A policy learns to end the episode as soon as it can.
 
     ## Why
-    If each step costs and a failure ends the episode, the earliest failure is the cheapest episode. A policy learns
-    to drop the cube at once.
+    If each step costs and a failure ends the episode, the earliest failure is the cheapest episode. A policy
+    learns to drop the cube at once.
 
     ## Fix
     Let a failure cost more than an episode without one can cost, or make the rewards of steps positive.
@@ -199,8 +199,7 @@ def failing_pays(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
     reward. The rule reports a task if there are at least three episodes and more than half of them end by
-    `fail` with a mean reward below 0. A rollout earns nothing after its failure, since an episode ends there
-    too.
+    `fail` with a mean reward below 0. Rollouts earn nothing after a failure, as in a real episode.
     """
     yield from _verdict(checkup, "failing-pays", "compute_dense_reward")
 
