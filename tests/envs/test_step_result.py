@@ -23,7 +23,8 @@ def test_every_field_counts() -> None:
     }
     evaluate, others = {"success": np.zeros(3, bool)}, {"mean": OtherEntry("float", ("0.5",))}
     drawn = {"goal": Drawing("points", np.zeros((3, 4, 3), np.float32))}
-    assert {one.name for one in fields(StepResult)} == {*arrays, "evaluate", "others", "drawn"}
-    step = StepResult(**arrays, evaluate=evaluate, others=others, drawn=drawn)
-    parts = [*arrays.values(), *evaluate.values(), *others.values(), *drawn.values()]
+    forces = {("cube", "table"): np.zeros(3, np.float32)}
+    assert {one.name for one in fields(StepResult)} == {*arrays, "evaluate", "others", "forces", "drawn"}
+    step = StepResult(**arrays, evaluate=evaluate, others=others, forces=forces, drawn=drawn)
+    parts = [*arrays.values(), *evaluate.values(), *others.values(), *forces.values(), *drawn.values()]
     assert step.nbytes == sum(part.nbytes for part in parts)
