@@ -121,9 +121,10 @@ def test_arrows_start_at_the_contact_points_and_are_limited() -> None:
 
 
 def test_a_pose_is_copied_as_python_that_recreates_it() -> None:
-    poses = np.array([[0.1, -2, 0, 1, 0, 0, 0], [np.nan] * 7], np.float32)
+    poses = np.array([[0.1, -7.6e-4, -1e-6, 1, 0, 0, 0], [np.nan] * 7], np.float32)
     [row] = pose_rows(("cube", "absent"), poses)
-    assert row["code"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
+    assert row["code"] == "sapien.Pose(p=[0.1, -0.00076, -0.000001], q=[1, 0, 0, 0])"
+    assert row["p"] == "0.1000, -0.0008, 0.0000", "no exponent and no negative zero among plain numbers"
 
 
 @pytest.mark.parametrize("choice", CHOICES)
@@ -236,7 +237,7 @@ def test_the_selected_body_has_its_own_physics_contacts_and_pose(live_page: Live
         "friction": "0.1 static, 0.2 dynamic; restitution 0.3",
         "joint": "hinge, revolute, no limits",
     }
-    assert shown(view) == facts and touched() == ["arm/hand"] and pose() == "0.010, 0.000, 0.020"
+    assert shown(view) == facts and touched() == ["arm/hand"] and pose() == "0.0100, 0.0000, 0.0200"
     assert inspect.presses(SelectBody(body="arm/hand"))
     slide = replace(PHYSICS, has_gravity=True, joint=LinkJoint("rail", "prismatic", 0.0, 2.0, ORIGIN, ORIGIN))
     later = shown(replace(view, inspection=replace(reading, body=slide), step_serial=2))
@@ -244,11 +245,11 @@ def test_the_selected_body_has_its_own_physics_contacts_and_pose(live_page: Live
     assert view.step is not None
     moved = replace(view.step, poses=view.step.poses + np.float32(0.5))
     shown(replace(view, step=moved, step_serial=3))
-    assert pose() == "0.510, 0.500, 0.520", "it follows the body while joints are listed"
+    assert pose() == "0.5100, 0.5000, 0.5200", "it follows the body while joints are listed"
     past = replace(view, timeline=TimelineView(0, 9, 5, 0, 5, 9), step_serial=4)
     assert shown(past) and touched() == [], "the reading is live"
     assert shown(replace(view, settings=replace(view.settings, selected_env=0))) == {}
-    assert pose() == "0.000, 0.000, 0.020" and touched() == []
+    assert pose() == "0.0000, 0.0000, 0.0200" and touched() == []
     assert shown(replace(view, inspection=replace(reading, body=replace(PHYSICS, name="table")))) == {}
     live_page.session.answers["segment"] = lambda: (4, 4)
     shown(replace(view, step_serial=5))
@@ -301,10 +302,10 @@ def test_bodies_are_listed_by_kind_with_their_own_poses(live_page: Live) -> None
         }
 
     every = {
-        "dynamic": ["0.010, 0.000, 0.020"],
-        "arm": ["0.000, 0.000, 0.500"],
-        "kinematic": ["0.000, 0.000, 0.000"],
-        "static": ["0.000, 0.000, 0.000"],
+        "dynamic": ["0.0100, 0.0000, 0.0200"],
+        "arm": ["0.0000, 0.0000, 0.5000"],
+        "kinematic": ["0.0000, 0.0000, 0.0000"],
+        "static": ["0.0000, 0.0000, 0.0000"],
     }
     assert listed() == every and list(listed()) == list(every) and inspect.typed("Show") == "bodies"
     for text, found in (

@@ -101,7 +101,7 @@ def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
         if np.isfinite(pose).all():
             p, q = pose[:3], pose[3:]
             code = f"sapien.Pose(p={_code(p)}, q={_code(q)})"
-            rows.append({"name": name, "p": vector(p), "q": vector(q), "code": code})
+            rows.append({"name": name, "p": pose_text(p), "q": pose_text(q), "code": code})
     return rows
 
 
@@ -118,6 +118,11 @@ def number(value: object) -> str:
     if value and not 1e-3 <= abs(value) < 1e4:
         return "0.000" if abs(value) < 1e-6 else f"{value:.1e}"
     return f"{value:.3f}"
+
+
+def pose_text(values: NDArray) -> str:
+    """Text of a position or a quaternion, to 0.1 mm: an exponent among plain numbers is easily overlooked."""
+    return ", ".join(f"{round(float(value), 4) + 0.0:.4f}" for value in values)
 
 
 def vector(values: NDArray) -> str:
