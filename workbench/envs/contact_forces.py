@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from sapien.physx import PhysxRigidBaseComponent
 
 from workbench.envs.scene.scene_index import once_a_scene, scene_index
-
-BodyPair = tuple[str, str]
-"""Names as in `SceneIndex.names`."""
+from workbench.envs.step_result import BodyPair
 
 
 def pair_forces(

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from workbench.envs.task_drawings import Drawing
 
+BodyPair = tuple[str, str]
+"""Names of two bodies, as in `envs.scene.scene_index.SceneIndex.names`."""
 TERM_PREFIX = "reward_terms/"
 """Prefix of the entries of a `StepResult` that are terms of a dense reward.
 
@@ -69,7 +71,7 @@ class StepResult:
     """(N, J) positions of the joints of `envs.scene.scene_index.joint_names`, in rad or m; None if there are none."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
     """All other entries of ``evaluate()``; no name is also in `evaluate`."""
-    forces: dict[tuple[str, str], NDArray[np.float32]] = field(default_factory=dict)
+    forces: dict[BodyPair, NDArray[np.float32]] = field(default_factory=dict)
     """(N,) newtons between the bodies of each watched pair, see `envs.contact_forces`."""
     drawn: dict[str, Drawing] = field(default_factory=dict)
     """What the task drew with `workbench.draw`, by name."""

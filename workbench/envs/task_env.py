@@ -24,7 +24,7 @@ from workbench.envs.backends import (
 )
 from workbench.envs.broken_rule import BrokenRules, warn_of
 from workbench.envs.camera_data import PictureDegree
-from workbench.envs.contact_forces import BodyPair, pair_forces
+from workbench.envs.contact_forces import pair_forces
 from workbench.envs.cpu_scene import batched_class, refuse_unbuilt_env
 from workbench.envs.evaluate_entries import FLAGS, flat_entries, split_entries
 from workbench.envs.gpu_rules import Degree, Finding, degrees_of
@@ -40,7 +40,7 @@ from workbench.envs.snapshots.snapshot import (
     restore_snapshot,
     take_snapshot,
 )
-from workbench.envs.step_result import StepResult
+from workbench.envs.step_result import BodyPair, StepResult
 from workbench.envs.strict import StrictMixin
 from workbench.envs.task_drawings import drawings
 from workbench.envs.wrong_options import wrong_option

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from workbench.actions.sources import ActionSource
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, Picture
-from workbench.envs.contact_forces import BodyPair
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Section
 from workbench.envs.recorded_run import RecordedRun
-from workbench.envs.step_result import StepResult
+from workbench.envs.step_result import BodyPair, StepResult
 from workbench.machine.processes.wire import Call, Question
 from workbench.planning.options import PlanOptions
 from workbench.task.description import ShownPictures, Stepped, TaskDescription, TaskOptions
