@@ -26,7 +26,7 @@ def test_a_reward_that_is_nan_in_states_that_random_actions_do_not_reach(checked
     # The cube is within a millimetre of the goal only if it is placed there.
     nan = "reward = reach + push + torch.sqrt((info['cube_to_goal'] - 0.001).sign())\n"
     finding = the_finding(checked("reward-finite", ("reward = reach + push\n", nan)))
-    assert "with bodies at the place of goal" in finding.message
+    assert "goal" in finding.message
     assert finding.function == "compute_dense_reward"
 
 

@@ -45,8 +45,10 @@ def test_a_sweep_prints_its_points_and_writes_its_results(
     assert [row["set.robot_uids"] for row in rows] == (["panda"] * 3 + ["nobody"] * 3) * 2
     assert rows[0]["return"] == str(results.episodes[0].total_reward)
     # Another sweep must not be mixed with it.
+    kept = tmp_path / "sweeps" / "reward_terms" / RESULTS
+    before = kept.read_bytes()
     assert sweep("--set", "MOST=3") == 2
-    assert "holds the results of another sweep" in capsys.readouterr().err
+    assert "sweeps/reward_terms" in capsys.readouterr().err and kept.read_bytes() == before
 
 
 def test_a_job_is_resumed_after_its_finished_runs(

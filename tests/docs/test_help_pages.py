@@ -70,7 +70,7 @@ def test_every_picture_exists_dark_and_light(topic: Topic) -> None:
 )
 def test_an_unknown_topic_gives_the_list_and_no_file_content(name: str) -> None:
     status, _, body = reply(name, {})
-    assert status == 404 and "There is no such page" in body.decode() and "root:" not in body.decode()
+    assert status == 404 and "safety" in body.decode() and "root:" not in body.decode()
     assert name not in body.decode()
 
 

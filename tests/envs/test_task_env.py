@@ -416,7 +416,7 @@ def test_gpu_simulation_is_used_only_on_request(monkeypatch: pytest.MonkeyPatch)
     }
     assert chosen == {"auto": "cpu", "cpu": "cpu", "gpu": "gpu"}
     text = backends.unused_gpu_text("auto")
-    assert text is not None and "--backend gpu" in text and "passed its tests on no machine" in text
+    assert text is not None and "--backend gpu" in text
     assert backends.unused_gpu_text("cpu") is backends.unused_gpu_text("gpu") is None
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
     assert backends.unused_gpu_text("auto") is None

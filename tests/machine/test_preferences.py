@@ -50,7 +50,7 @@ def test_a_corrupt_file_gives_defaults_and_is_logged(
 ) -> None:
     write_private(FILE, content)
     assert not preferences().hints_closed
-    assert "Stored choices cannot be read" in caplog.text
+    assert [one.levelname for one in caplog.records] == ["WARNING"]
     close_hints()
     assert preferences().hints_closed
 
@@ -60,7 +60,7 @@ def test_a_failed_write_is_logged_and_not_raised(caplog: pytest.LogCaptureFixtur
     user_folder().chmod(0o777)
     before = (user_folder() / FILE).read_bytes()
     keep_policy(Path("/lab"), "a.py:act")
-    assert "cannot be stored for the next run" in caplog.text
+    assert [one.levelname for one in caplog.records] == ["WARNING"]
     user_folder().chmod(0o700)
     assert read_private(FILE) == before
 

@@ -59,7 +59,7 @@ def test_good_episodes_have_no_verdict() -> None:
 def test_an_unsolved_episode_that_ran_out_of_time_has_no_verdict() -> None:
     slow = unsolved(np.linspace(0, 0.7, STEPS).tolist())
     assert rules(rises(), slow) == []
-    assert in_the_way(slow, [rises(), slow]) == "not solved within the step limit"
+    assert "step limit" in in_the_way(slow, [rises(), slow])
 
 
 def test_a_higher_reward_without_success_is_an_exploit() -> None:

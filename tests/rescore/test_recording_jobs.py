@@ -118,7 +118,7 @@ def test_unusable_recordings_are_reported_with_a_reason_and_the_others_are_resco
     by_name = {verdict.of.name: verdict for verdict in verdicts_of(task, files, True)}
     task.env.close()
     assert "3 dimensions" in by_name["narrow"].why_not and by_name["empty"].why_not == "it has no step"
-    assert by_name["no states"].why_not == "it has no recorded env states"
+    assert "env states" in by_name["no states"].why_not
     assert by_name["fine"].why_not == "" and not by_name["fine"].differs
 
 

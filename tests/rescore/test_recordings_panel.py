@@ -54,7 +54,6 @@ def test_all_verdicts_are_summarised_in_one_sentence() -> None:
         "1 of 2 episodes differs. Episodes with success: 0 → 1. Mean return: 5.5 → 7.5. 1 episode not rescored."
     )
     assert verdict_text.summary(many[:1]).startswith("Nothing differs in 1 episode:")
-    assert verdict_text.summary(many[2:]) == "No episode could be rescored."
     assert "exactly where it was recorded" in verdict_text.drift_summary(
         many
     ) and not verdict_text.count_drifted(many)

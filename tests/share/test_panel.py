@@ -127,7 +127,7 @@ def test_only_successes_cannot_be_ticked_without_a_success(
     panels.set("Make", "LeRobot dataset")
     panel.draw(Chosen(several, successes=0))
     ticked = panels.field("Only successes")
-    assert ticked.off and not ticked.value and "None of these recordings reaches success" in panels.html()
+    assert ticked.off and not ticked.value
     panels.press("Make")
     assert not making.wanted[-1].export.only_successes
     panel.draw(Chosen(several, successes=2))

@@ -258,9 +258,7 @@ def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: A
     assert edited.best_distance.tolist() == [1.0, 2.0, 3.0, 4.0]
     assert edited.velocity_bonus.tolist() == [3.0] * N
     assert edited.half.shape == (N, 2)
-    assert report.not_carried["half"].startswith("it had shape")
-    assert report.not_carried["notes.visits"] == "the task no longer has an attribute of this name"
-    assert report.not_carried["velocity_bonus"].startswith("it is not in the snapshot")
+    assert {"half", "notes.visits", "velocity_bonus"} <= report.not_carried.keys()
     edited.close()
 
 
