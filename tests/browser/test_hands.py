@@ -108,11 +108,10 @@ def test_a_cube_that_is_dragged_to_the_target_while_the_envs_play_succeeds(desk:
 def test_handles_move_a_body_in_the_selected_env_only_and_undo_brings_it_back(desk: Desk) -> None:
     page = desk.page
     desk.select_body("cube")
+    first = desk.body_position()
     desk.press("n")
-    desk.timeline_says("env 1")
-    other = desk.body_position()
+    other = until(lambda: now if (now := desk.body_position()) != first else None, "the cube of env 1")
     desk.press("p", "m")
-    desk.timeline_says("env 0")
     before = until(lambda: now if (now := desk.body_position()) != other else None, "the cube of env 0")
     x, y = handles(desk, 1)
     page.mouse.move(x, y)
