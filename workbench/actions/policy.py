@@ -23,6 +23,7 @@ from workbench.task.library_names import (
     files_named_like_libraries,
     is_library,
     named_like_library_text,
+    own_modules_first,
     searched_first,
 )
 from workbench.task.problem import Problem, definition_line, problem_from_exception
@@ -81,7 +82,7 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
             if file not in (path, *_warned):
                 _warned.add(file)
                 print(named_like_library_text(file), file=sys.stderr)
-        with searched_first(path.parent):
+        with searched_first(path.parent), own_modules_first(path.parent):
             spec.loader.exec_module(module)
     elif importlib.util.find_spec(package := name.partition(".")[0]) is None:
         # A module that is not installed is searched for in the current folder.

@@ -51,6 +51,32 @@ def is_own_file(path: str, folder: Path) -> bool:
     )
 
 
+def importable_names(folder: Path) -> frozenset[str]:
+    """Names of the modules and packages in `folder`; empty if it cannot be listed."""
+    try:
+        entries = list(os.scandir(folder))
+    except OSError:
+        return frozenset()
+    return frozenset(
+        one.name.removesuffix(".py") for one in entries if one.name.endswith(".py") or one.is_dir()
+    )
+
+
+def hides_module_of(folder: Path, name: str, module: ModuleType, names: frozenset[str]) -> bool:
+    """Whether the loaded module `name` is an author's of another folder, so that ``import`` would give it instead of a
+    module of the same name in `folder`.
+
+    Args:
+        names: `importable_names` of the folder.
+    """
+    # Not getattr: it triggers the imports of lazy modules.
+    file = getattr(module, "__dict__", {}).get("__file__")
+    if name.partition(".")[0] not in names or not isinstance(file, str) or not file.endswith(".py"):
+        return False
+    is_librarys = file.startswith(LIBRARY_ROOTS) or not LIBRARY_FOLDERS.isdisjoint(file.split(os.sep))
+    return not is_librarys and not is_own_file(file, folder)
+
+
 def is_library(name: str) -> bool:
     """Whether the top-level module `name` is a library's, even if an author has a file of that name."""
     # The slow check is last: reading the contents of the distributions takes 0.1 s, once.
@@ -120,6 +146,27 @@ def searched_first(folder: Path) -> Iterator[None]:
         sys.path[:] = [*added, *path]
         if not guarded:
             remove_library_finder()
+
+
+@contextmanager
+def own_modules_first(folder: Path) -> Iterator[None]:
+    """Context manager: in its block ``import`` gives the modules of `folder`, not modules of the same names that were
+    loaded from another author's folder. Afterwards those are in ``sys.modules`` again."""
+    names = importable_names(folder)
+    others = {
+        name: module
+        for name, module in list(sys.modules.items())
+        if hides_module_of(folder, name, module, names)
+    }
+    for name in others:
+        del sys.modules[name]
+    try:
+        yield
+    finally:
+        hidden = {name.partition(".")[0] for name in others}
+        for name in [name for name in sys.modules if name.partition(".")[0] in hidden]:
+            del sys.modules[name]
+        sys.modules.update(others)
 
 
 def remove_library_finder() -> None:

@@ -20,7 +20,14 @@ from typing import Any
 
 from workbench.machine.files import MAX_SOURCE_BYTES, read_regular_file
 from workbench.source.parsed import plain_line_ends
-from workbench.task.library_names import LIBRARY_ROOTS, files_named_like_libraries, is_library, is_own_file
+from workbench.task.library_names import (
+    LIBRARY_ROOTS,
+    files_named_like_libraries,
+    hides_module_of,
+    importable_names,
+    is_library,
+    is_own_file,
+)
 
 _MODULE_PREFIX = "workbench_task_"
 
@@ -311,6 +318,7 @@ def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -
     returns True, stay: they are not imported by name, and their classes may be in use.
     """
     folder = finder.own_folder
+    names = importable_names(finder.search_folder)
     unloaded: dict[str, ModuleType] = {}
     for name, module in list(sys.modules.items()):
         if name in ("__main__", "__mp_main__") or is_other_task(name):
@@ -325,6 +333,8 @@ def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -
         elif isinstance(file, str):
             if file.endswith(".py") and is_own_file(file, folder):
                 unloaded[name] = module
+            elif hides_module_of(folder, name, module, names):
+                unloaded[name] = module  # such as a helper of a policy in another folder
             elif file.startswith(LIBRARY_ROOTS):
                 _libraries[name] = module
         elif spec is not None and spec.origin is None and spec.submodule_search_locations is not None:
