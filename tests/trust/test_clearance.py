@@ -16,7 +16,7 @@ from tests.drive.episodes import begin, made, write
 from workbench.episodes.document import write_into_description
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.recorded_source import recorded_source, reference_of
+from workbench.episodes.recorded_source import reference_of
 from workbench.episodes.seal import KEY_FILE, InstallationSeal, made_here
 from workbench.episodes.writing.finish_or_recover import recover
 from workbench.machine.folders import user_folder
@@ -32,7 +32,7 @@ from workbench.trust.clearance import (
     TrustQuestion,
     paths_in_arguments,
 )
-from workbench.trust.store import STORE_FILE, TrustStore
+from workbench.trust.store import TrustStore
 
 pytestmark = pytest.mark.thorough
 
@@ -82,14 +82,16 @@ def info_of(recording: Path) -> EpisodeInfo:
     return read_episode(recording).info
 
 
+def text_of(info: EpisodeInfo) -> CodeToRun:
+    return CodeToRun(reference_of(info), info, recorded_text=True)
+
+
 def todays(recording: Path) -> CodeToRun:
-    info = info_of(recording)
-    return CodeToRun(reference_of(info), info)
+    return replace(text_of(info_of(recording)), recorded_text=False)
 
 
 def as_recorded(recording: Path) -> CodeToRun:
-    info = info_of(recording)
-    return CodeToRun(reference_of(info), info, recorded_text=True)
+    return text_of(info_of(recording))
 
 
 def asked(wanted: CodeToRun, answer: Consent = Consent.NO) -> list[TrustQuestion]:
@@ -148,18 +150,15 @@ def test_without_a_user_to_ask_the_answer_is_no(foreign: Path) -> None:
             Clearances().clear(wanted)
         assert refused.value.question is not None
         assert Clearances(all_trusted=True).clear(wanted)
-    assert TrustStore().trusts(read_content(foreign.parents[1] / "push.py")) is False, (
-        "--trust stores nothing"
-    )
+    assert not TrustStore().trusts(read_content(foreign.parents[1] / "push.py")), "--trust stores nothing"
 
 
 def test_a_file_named_by_the_user_needs_no_question(foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
     assert Clearances(lambda: [file]).clear(todays(foreign)) == str(file)
     assert Clearances().clear(CodeToRun("any_file.py", info_of(foreign))) == "any_file.py"
-    assert Clearances().clear(CodeToRun(RecordedTask("PickCube-v1"), info_of(foreign))) == RecordedTask(
-        "PickCube-v1"
-    )
+    installed = RecordedTask("PickCube-v1")
+    assert Clearances().clear(CodeToRun(installed, info_of(foreign))) == installed
 
 
 def test_an_answer_applies_to_the_same_texts_anywhere(foreign: Path, tmp_path: Path) -> None:
@@ -209,9 +208,8 @@ def test_following_a_file_is_a_separate_question(foreign: Path, tmp_path: Path) 
     copy = tmp_path / "copy"
     shutil.copytree(foreign.parents[1], copy)
     there = todays(copy / "recordings" / foreign.name)
-    assert asked(there) == [] and len(asked(replace(there, followed=True))) == 1, (
-        "saves of this copy were not agreed to"
-    )
+    assert asked(there) == []
+    assert len(asked(replace(there, followed=True))) == 1, "saves of this copy were not agreed to"
     assert Clearances(all_trusted=True).clear(live)
 
 
@@ -255,8 +253,8 @@ def test_foreign_arguments_cannot_name_files(
             Clearances(ask=Answering(Consent.ALWAYS)).clear(wanted)
         assert refused.value.trust_helps
         Clearances(all_trusted=True).clear(wanted)
-    with pytest.raises(SceneError, match="only numbers and curves"):
-        SceneProcess()._make(None, read_episode(foreign), lambda: None, print)  # type: ignore[arg-type]
+    (scene,) = SceneProcess()([read_episode(foreign)], lambda: None, lambda *_: None)
+    assert isinstance(scene, SceneError) and "only numbers and curves" in str(scene)
 
 
 # --- the seal ----------------------------------------------------------------------------------------
@@ -288,9 +286,7 @@ def test_a_returned_recording_with_a_changed_file_next_to_it_asks(recording: Pat
     shutil.rmtree(recording.parents[1])
     assert made_here(info_of(returned)) is InstallationSeal.CONTENT
     cleared = Clearances().clear(todays(returned))
-    assert isinstance(cleared, RecordedTask) and cleared.file == str(back / "push.py"), (
-        "it has the text that was recorded here"
-    )
+    assert isinstance(cleared, RecordedTask) and cleared.file == str(back / "push.py")
     (back / "helper.py").write_text("evil\n")
     assert len(asked(todays(returned))) == 1
     assert asked(as_recorded(returned)) == []
@@ -299,26 +295,13 @@ def test_a_returned_recording_with_a_changed_file_next_to_it_asks(recording: Pat
 def test_a_foreign_journal_is_recovered_without_a_seal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for who, is_ours in (("config", True), ("another", False)):
-        begin(
-            tmp_path / who,
-            made(3, source_file=str(tmp_path / "push.py"), source={str(tmp_path / "push.py"): "x"}),
-        )
+    file = str(tmp_path / "push.py")
+    for folder, is_ours in ((tmp_path / "ours", True), (tmp_path / "theirs", False)):
+        begin(folder, made(3, source_file=file, source={file: "x"}))
         if not is_ours:
-            another_user(tmp_path / "third", monkeypatch)
-        (files,) = recover(tmp_path / who)
+            another_user(tmp_path / "another", monkeypatch)
+        (files,) = recover(folder)
         assert (made_here(info_of(files.json)) is not InstallationSeal.NO) is is_ours
-
-
-def test_an_importable_side_file_is_not_placed_next_to_the_recorded_code(recording: Path) -> None:
-    folder = recording.parents[1]
-    for name in ("mesh.obj", "numpy.py", "json.cpython-311-x86_64-linux-gnu.so"):
-        (folder / name).write_text("")
-    names = ("mesh.obj", "numpy.py", "json.cpython-311-x86_64-linux-gnu.so")
-    info = replace(info_of(recording), side_files=dict.fromkeys(names, "0" * 12))
-    with recorded_source(info) as reference:
-        beside = {path.name for path in Path(reference.split(":")[0]).parent.iterdir()}
-    assert beside == {"push.py", "helper.py", "mesh.obj"}
 
 
 # --- storage of the key and of the answers --------------------------------------------------------------------------------
@@ -334,40 +317,6 @@ def test_without_the_key_a_recording_is_foreign_and_the_next_gets_a_new_key(
     again = write(tmp_path / "again", made(2), pictures=False)
     assert made_here(info_of(again)) is not InstallationSeal.NO and len(path.read_text()) == 64
     assert path.with_name(f"{KEY_FILE}.broken").exists() is (key is not None)
-
-
-@pytest.mark.parametrize(
-    "store",
-    [
-        "",
-        '{"trusted": [{"hash": 1}]}',
-        '{"trusted": [{"hash": "1", "file": "", "when": "", "files": [1]}]}',
-        "[" * 100_000,
-    ],
-)
-def test_a_broken_store_trusts_nothing_is_reported_once_and_backed_up(
-    foreign: Path, store: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    content = read_content(foreign.parents[1] / "push.py")
-    user_folder().mkdir(parents=True)
-    (user_folder() / STORE_FILE).write_text(store)
-    kept = TrustStore()
-    assert not kept.trusts(content) and not kept.trusts(content)
-    (said,) = [record.message for record in caplog.records if "broken" in record.message]
-    assert str(user_folder() / STORE_FILE) in said
-    kept.trust(content)
-    assert TrustStore().trusts(content)
-    assert (user_folder() / f"{STORE_FILE}.broken").read_text() == store
-
-
-def test_a_store_writable_by_others_trusts_nothing(foreign: Path, caplog: pytest.LogCaptureFixture) -> None:
-    content = read_content(foreign.parents[1] / "push.py")
-    TrustStore().trust(content)
-    (user_folder() / STORE_FILE).chmod(0o666)
-    assert not TrustStore().trusts(content) and "chmod go-w" in caplog.text
-    (user_folder() / STORE_FILE).chmod(0o600)
-    user_folder().chmod(0o777)
-    assert not TrustStore().trusts(content)
 
 
 # --- a file that was chosen from a list -----------------------------------------------------------
@@ -399,11 +348,10 @@ def test_a_listed_file_asks_once_with_its_text_and_modules(tmp_path: Path) -> No
 
 def test_a_refusal_of_all_is_not_asked_again_and_a_refusal_of_one_is_for_its_text_only(foreign: Path) -> None:
     info = info_of(foreign)
-    infos = [
-        replace(info, source={file: f"{text}# {number}\n" for file, text in info.source.items()})
+    codes = [
+        text_of(replace(info, source={file: f"{text}# {number}\n" for file, text in info.source.items()}))
         for number in (1, 2, 2, 3)
     ]
-    codes = [CodeToRun(reference_of(one), one, recorded_text=True) for one in infos]
     for answer, questions in ((Consent.NONE, 1), (Consent.NO, 3)):
         person = Answering(answer)
         cleared = Clearances(ask=person).clear_all(codes)
@@ -465,12 +413,10 @@ def test_each_recording_gets_the_answer_to_its_own_text(foreign: Path) -> None:
     info = info_of(foreign)
 
     def code(text: str) -> CodeToRun:
-        other = replace(info, source={file: f"{text} # {file}\n" for file in info.source})
-        return CodeToRun(reference_of(other), other, recorded_text=True)
+        return text_of(replace(info, source={file: f"{text} # {file}\n" for file in info.source}))
 
     codes = [code("yes"), CodeToRun("PickCube-v1", info), code("no"), code("yes"), code("yes too")]
-    without = replace(info, source={})
-    codes.append(CodeToRun(reference_of(without), without, recorded_text=True))
+    codes.append(text_of(replace(info, source={})))
     questions: list[TrustQuestion] = []
 
     def ask(question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:

@@ -10,18 +10,15 @@ import pty
 import select
 import shutil
 import sys
+import tempfile
 from html import unescape
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
-import mani_skill.envs  # noqa: F401  registers the ids
-import numpy as np
 import pytest
-from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.session import rescored
 from tests.drive.waiting import until
+from tests.episodes.foreign_h5 import write as write_foreign
 from workbench.cli.main import main
 from workbench.cli.output import Exit
 from workbench.cli.rescore import RescoreOptions, rescore_all
@@ -70,10 +67,7 @@ def foreign(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def ran(folder: Path) -> bool:
     """Whether the task, from the folder or from its recordings, was imported since the last call."""
-    marks = [
-        *folder.glob("*.ran"),
-        *(Path(os.environ.get("TMPDIR", "/tmp")).glob("workbench-recorded-*/*.ran")),
-    ]
+    marks = [*folder.glob("*.ran"), *Path(tempfile.gettempdir()).glob("workbench-recorded-*/*.ran")]
     for mark in marks:
         mark.unlink()
     return bool(marks)
@@ -82,41 +76,25 @@ def ran(folder: Path) -> bool:
 # --- opening a row -----------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def made_by_maniskill(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("stock")
-    env: Any = gym.make("PickCube-v1", obs_mode="state", render_backend="none")
-    env = RecordEpisode(env, str(folder), save_video=False, trajectory_name="demos", source_type="test")
-    env.reset(seed=1)
-    for _ in range(2):
-        env.step(np.zeros(8, np.float32))
-    env.close()
-    return folder
-
-
 @pytest.fixture
-def stock(made_by_maniskill: Path, tmp_path: Path) -> Path:
-    """The .json of a ManiSkill .h5/.json pair; next to it is a file that leaves a mark when it runs."""
-    for name in ("demos.h5", "demos.json"):
-        shutil.copy(made_by_maniskill / name, tmp_path)
-    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'evil_ran')!r}, 'w').write('ran')\n")
-    return tmp_path / "demos.json"
-
-
-def name_evil(pair: Path) -> None:
-    document = json.loads(pair.read_text())
-    document["env_info"]["env_id"] = str(pair.parent / "evil.py")
-    pair.write_text(json.dumps(document))
-
-
-def test_a_path_instead_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Path, tmp_path: Path) -> None:
-    name_evil(stock)
+def mark(tmp_path: Path) -> Path:
+    """What the file evil.py in the same folder leaves behind when it runs."""
     mark = tmp_path / "evil_ran"
-    library = Library(tmp_path)
+    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w').write('ran')\n")
+    return mark
+
+
+def test_a_path_instead_of_an_id_is_not_loaded_when_its_row_is_opened(mark: Path) -> None:
+    folder = mark.parent
+    pair = write_foreign(folder).with_suffix(".json")
+    document = json.loads(pair.read_text())
+    document["env_info"]["env_id"] = str(folder / "evil.py")
+    pair.write_text(json.dumps(document))
+    library = Library(folder)
     review = Review(library, make_scene=SceneProcess())
     try:
-        library.watch()
-        (row,) = until(lambda: library.view().rows, "its row")
+        library.refresh()
+        (row,) = library.view().rows
         review.open((row.id,))
         until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the explanation")
     finally:
@@ -129,10 +107,8 @@ def test_a_path_instead_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Pat
     "named", ["{file}", "{file}:Evil", "./evil.py", "evil.py", "evil:Evil-v0", "~/evil.py"]
 )
 def test_no_notation_of_a_name_in_a_recording_opens_a_file(
-    tmp_path: Path, named: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, mark: Path, named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mark = tmp_path / "evil_ran"
-    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w').write('ran')\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     wanted = MakeScene(named.format(file=tmp_path / "evil.py"), (), {}, 0, {}, {})
@@ -236,9 +212,8 @@ def test_on_a_page_it_asks_and_no_skips_only_that_recording(foreign: Path, recor
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view
         (said,) = view.warnings
-        assert f"{foreign / 'numpy.py'} has the name of a library" in said and said in unescape(
-            status_html(view)
-        )
+        assert f"{foreign / 'numpy.py'} has the name of a library" in said
+        assert said in unescape(status_html(view))
         assert ran(foreign) and [[one.name for one in q.modules] for q in asked] == [["marks.py"]] * 2
     finally:
         rescorer.close()

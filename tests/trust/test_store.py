@@ -13,8 +13,8 @@ from workbench.trust import store as trust
 from workbench.trust.store import STORE_FILE, TrustStore
 
 
-def content(text: str = "a", file: str = "/author/push.py") -> TaskContent:
-    return TaskContent(file, {file: text})
+def content(text: str = "a") -> TaskContent:
+    return TaskContent("/author/push.py", {"/author/push.py": text})
 
 
 @pytest.fixture(autouse=True)
@@ -23,25 +23,36 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "workbench" / STORE_FILE
 
 
-def test_only_consents_are_known_to_the_next_program() -> None:
-    TrustStore().trust(content("one"))
-    TrustStore().trust(content("two"), followed=True)
-    later = TrustStore()
-    assert later.trusts(content("one")) and not later.follows(content("one"))
-    assert later.trusts(content("two")) and later.follows(content("two"))
-    # The same text in another file may run; saves of that file were not agreed to.
-    elsewhere = content("two", "/other/push.py")
-    assert later.trusts(elsewhere) and not later.follows(elsewhere)
-    assert not later.trusts(content("three"))
-
-
-def test_once_lasts_until_the_program_ends(store: Path) -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        '{"trusted": [{"hash": 1}]}',
+        '{"trusted": [{"hash": "1", "file": "", "when": "", "files": [1]}]}',
+        "[" * 100_000,
+    ],
+)
+def test_a_broken_store_trusts_nothing_is_reported_once_and_backed_up(
+    store: Path, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    store.parent.mkdir()
+    store.write_text(text)
     kept = TrustStore()
-    kept.trust_once(content("one"))
-    kept.trust_once(content("two"), followed=True)
-    assert kept.trusts(content("one")) and not kept.follows(content("one"))
-    assert kept.follows(content("two")) and not kept.follows(content("two", "/other/push.py"))
-    assert not TrustStore().trusts(content("one")) and not store.exists()
+    assert not kept.trusts(content()) and not kept.trusts(content())
+    (said,) = [record.message for record in caplog.records if "broken" in record.message]
+    assert str(store) in said
+    kept.trust(content())
+    assert TrustStore().trusts(content())
+    assert store.with_name(f"{STORE_FILE}.broken").read_text() == text
+
+
+def test_a_store_writable_by_others_trusts_nothing(store: Path, caplog: pytest.LogCaptureFixture) -> None:
+    TrustStore().trust(content())
+    store.chmod(0o666)
+    assert not TrustStore().trusts(content()) and "chmod go-w" in caplog.text
+    store.chmod(0o600)
+    store.parent.chmod(0o777)
+    assert not TrustStore().trusts(content())
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
