@@ -20,13 +20,23 @@ from workbench.task.problem import TaskError
 N = 2
 
 
-@pytest.fixture(scope="module")
-def task() -> Iterator[TaskEnv]:
-    env = batched("PushCube-v1", N, control_mode="pd_joint_pos")
+def task_with(control_mode: str) -> Iterator[TaskEnv]:
+    env = batched("PushCube-v1", N, control_mode=control_mode)
     task = TaskEnv(env, 50)
     task.reset(seed=0)
     yield task
     env.close()
+
+
+@pytest.fixture(scope="module")
+def task() -> Iterator[TaskEnv]:
+    yield from task_with("pd_joint_pos")
+
+
+@pytest.fixture(scope="module")
+def deltas() -> Iterator[TaskEnv]:
+    """A task whose arm takes deltas, and whose gripper takes targets."""
+    yield from task_with("pd_joint_delta_pos")
 
 
 @pytest.fixture
@@ -48,29 +58,7 @@ def test_an_env_that_is_told_to_hold_still_or_was_reset_forgets_its_joint_target
         np.testing.assert_array_equal(action[1], still[1])
 
 
-def test_a_policy_that_raised_is_imported_again_for_the_next_action(
-    task: TaskEnv, chooser: ActionChooser, tmp_path: Path, clean_process: None
-) -> None:
-    file = tmp_path / "own_policy.py"
-    file.write_text("def act(obs):\n    raise ValueError('not yet')\n")
-    chooser.use("policy", f"{file}:act")
-    with pytest.raises(TaskError, match="not yet"):
-        chooser.next_action(task)
-    file.write_text("import numpy as np\n\n\ndef act(obs):\n    return np.full((2, 8), 0.5)\n")
-    np.testing.assert_array_equal(chooser.next_action(task), np.full((N, 8), 0.5))
-
-
 # --- sources ---------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def deltas() -> Iterator[TaskEnv]:
-    """A task whose arm takes deltas, and whose gripper takes targets."""
-    env = batched("PushCube-v1", N, control_mode="pd_joint_delta_pos")
-    task = TaskEnv(env, 50)
-    task.reset(seed=0)
-    yield task
-    env.close()
 
 
 def test_each_source_has_its_name_and_its_action(task: TaskEnv, chooser: ActionChooser) -> None:
@@ -102,29 +90,32 @@ def test_a_slider_sets_its_own_dimension_in_its_own_envs_within_the_bounds(
     arm, gripper = 0, len(low) - 1
     chooser.use("sliders", None)
     assert chooser.by_sliders
-    expected = hold_action(deltas.parts, N)
+    still, expected = hold_action(deltas.parts, N), hold_action(deltas.parts, N)
+
+    def assert_acts_as_expected() -> None:
+        np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+
     chooser.set_sliders(deltas, [1], [arm, gripper], [0.02, 0.5])
     expected[1, [arm, gripper]] = np.clip([0.02, 0.5], low[[arm, gripper]], high[[arm, gripper]])
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+    assert_acts_as_expected()
     chooser.set_sliders(deltas, [0], [arm], [9.0])
     expected[0, arm] = high[arm]
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+    assert_acts_as_expected()
     acted = np.full((N, len(low)), 0.01, np.float32)
     chooser.acted(acted)
     expected[:, gripper] = acted[:, gripper]
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+    assert_acts_as_expected()
     acted[:] = 9.0  # the chooser must not keep the caller's array
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
-    still = hold_action(deltas.parts, N)
+    assert_acts_as_expected()
     chooser.begin([0], {1: np.full(len(low), 0.02, np.float32)})
     expected[0, gripper], expected[1, gripper] = still[0, gripper], 0.02
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+    assert_acts_as_expected()
     chooser.begin(None)
     expected[:, gripper] = still[:, gripper]
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+    assert_acts_as_expected()
     chooser.set_sliders(deltas, [1], [], [])
     expected[1] = still[1]
-    np.testing.assert_allclose(chooser.next_action(deltas), expected, rtol=1e-6)
+    assert_acts_as_expected()
     for forget in (chooser.new_scene, lambda: chooser.use("sliders", None)):
         chooser.set_sliders(deltas, [0], [arm], [0.02])
         forget()
@@ -134,17 +125,13 @@ def test_a_slider_sets_its_own_dimension_in_its_own_envs_within_the_bounds(
 @pytest.mark.parametrize(
     ("text", "name", "line"),
     [
-        (
-            "import policy_helper\n\n\ndef act(obs):\n    return policy_helper.fails()\n",
-            "policy_helper.py",
-            2,
-        ),
+        ("import policy_helper\ndef act(obs):\n    return policy_helper.fails()\n", "policy_helper.py", 2),
         ("\ndef act(obs):\n    return obs[:, :3]\n", "own_policy.py", 2),
         ("def act(obs):\n    return (\n", "own_policy.py", 2),
         ("x = 1\nx.nothing\n", "own_policy.py", 2),
     ],
 )
-def test_a_failure_of_a_policy_is_at_the_authors_line(
+def test_a_failure_of_a_policy_is_at_the_authors_line_and_its_next_save_acts(
     task: TaskEnv,
     chooser: ActionChooser,
     tmp_path: Path,
