@@ -1,12 +1,10 @@
-"""Entering a recording's state in the live session with a real worker; and which code is opened for a recording."""
+"""Entering a recording's state in the live session with a real worker."""
 
 # pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +14,9 @@ from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.live.recorded_runs import opened, reaching, record
 from workbench.app.session import Session
 from workbench.envs.recorded_run import RecordedRun
-from workbench.episodes.episode import EpisodeInfo
-from workbench.episodes.recorded_source import CannotEnterRecording, options_of, recorded_source, reference_of
 from workbench.live.events import SlidersMoved
 from workbench.live.timeline_commands import UndoReset
 from workbench.live.view import SessionView
-from workbench.task.description import TaskOptions
 
 N, STEPS, ENV = 3, 40, 1
 
@@ -128,86 +123,7 @@ def test_a_renamed_actor_is_reported_and_the_robot_is_restored(live: Session, ru
     view = into(live, run.until(12))
     not_carried = "; ".join(view.timeline.not_carried)
     assert "actors/cube: " in not_carried and "actors/box: " in not_carried
-    names = view.task.geometry.body_names
-    hand = names.index("panda/panda_hand")
-    assert np.allclose(
-        view.step.poses[ENV][hand][:3], poses[12][names.index("panda/panda_hand")][:3], atol=2e-4
-    )
+    hand = view.task.geometry.body_names.index("panda/panda_hand")
+    assert np.allclose(view.step.poses[ENV][hand][:3], poses[12][hand][:3], atol=2e-4)
     file.write_text(text)
     wait_until(live, lambda v: "cube" in v.task.geometry.body_names, "the old scene")
-
-
-# --- what is opened ----------------------------------------------------------------------------------
-
-
-def info(file: Path | None, task: str = "WorkbenchPushCube-v1", **more: object) -> EpisodeInfo:
-    source = {} if file is None else {file.name: file.read_text()}
-    plain = EpisodeInfo(
-        task, 0, 5, None if file is None else str(file), "", source, 0.05, "pd_joint_delta_pos", "cpu"
-    )
-    return replace(plain, **more)  # pyright: ignore[reportArgumentType]
-
-
-def test_todays_code_is_the_file_if_it_still_exists_else_the_id(tmp_path: Path) -> None:
-    file = TASKS / "push_cube.py"
-    assert str(reference_of(info(file))).startswith(f"{file}:")
-    deleted = replace(info(file), source_file=str(tmp_path / "deleted.py"))
-    assert str(reference_of(deleted)) == "WorkbenchPushCube-v1"
-    assert str(reference_of(info(None, "PickCube-v1"))) == "PickCube-v1"
-    from importlib.util import find_spec
-
-    spec = find_spec("mani_skill")
-    assert spec is not None and spec.submodule_search_locations
-    installed = Path(spec.submodule_search_locations[0]) / "envs" / "tasks" / "tabletop" / "pick_cube.py"
-    assert str(reference_of(replace(info(None, "PickCube-v1"), source_file=str(installed)))) == "PickCube-v1"
-
-
-def test_the_recorded_text_is_opened_in_a_temporary_folder(tmp_path: Path) -> None:
-    helper = {"helpers/shapes.py": "SIZE = 1\n", "../../outside.py": "x = 1\n"}
-    recorded = info(TASKS / "push_cube.py")
-    recorded = replace(recorded, source={**recorded.source, **helper}, source_file="push_cube.py")
-    with recorded_source(recorded) as reference:
-        file, _, name = reference.rpartition(":")
-        folder = Path(file).parent
-        assert Path(file).read_text() == (TASKS / "push_cube.py").read_text() and name
-        assert (folder / "helpers" / "shapes.py").read_text() == "SIZE = 1\n"
-        assert (folder / "outside.py").is_file()  # and nowhere else
-    assert not folder.exists()
-    with pytest.raises(CannotEnterRecording, match="does not hold the text"), recorded_source(info(None)):
-        pass
-
-
-def test_todays_files_beside_the_task_are_available_and_outlive_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    file = tmp_path / "author" / "push_cube.py"
-    (file.parent / "meshes").mkdir(parents=True)
-    file.write_text((TASKS / "push_cube.py").read_text())
-    (file.parent / "meshes" / "part.obj").write_text("today's")
-    (tmp_path / "secret").write_text("")
-    above = ("../secret", "meshes/../../secret", str(tmp_path / "secret"))
-    names = ("meshes/part.obj", "meshes/deleted.obj", *above)
-    with recorded_source(info(file, side_files=dict.fromkeys(names, "0" * 12))) as reference:
-        folder = Path(reference.rpartition(":")[0]).parent
-        assert (folder / "meshes" / "part.obj").read_text() == "today's"
-        assert {path.name for path in folder.rglob("*")} == {"push_cube.py", "meshes", "part.obj"}
-        assert list(temporary.iterdir()) == [folder], "no other folder was made"
-    assert not folder.exists()
-    assert (file.parent / "meshes" / "part.obj").read_text() == "today's"
-
-
-def test_the_env_is_made_with_the_recorded_robot_and_modes() -> None:
-    kwargs = {"robot_uids": "panda_wristcam", "obs_mode": "rgb", "num_envs": 64, "sim_backend": "gpu"}
-    kwargs |= {"render_device": "cuda:1", "render_mode": "human", "render_backend": "gpu"}
-    base = TaskOptions(rules="warn")
-    options = options_of(replace(info(None, "PickCube-v1"), env_kwargs=kwargs), 2, base)
-    assert options.rules == "warn"
-    assert options.env_kwargs == {
-        "robot_uids": "panda_wristcam",
-        "obs_mode": "rgb",
-        "control_mode": "pd_joint_delta_pos",
-    }
-    assert (options.num_envs, options.seed) == (2, 5)

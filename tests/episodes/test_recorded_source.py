@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mani_skill
 import numpy as np
 import pytest
 
@@ -17,11 +17,12 @@ from workbench.episodes.recorded_source import (
     CannotEnterRecording,
     class_in,
     options_of,
+    recorded_source,
     recorded_version,
     reference_of,
     run_of,
-    write_source,
 )
+from workbench.task.description import TaskOptions
 
 TWO = """
 from mani_skill.utils.registration import register_env
@@ -59,64 +60,91 @@ def test_a_run_has_no_state_beyond_its_episode_and_no_reward_that_the_task_lacks
     assert run_of(made(4, seed=-1)).name == "Push-v1"
 
 
-def test_the_class_is_the_one_with_the_recorded_id(tmp_path: Path) -> None:
+def test_todays_code_is_the_class_with_the_recorded_id_else_the_id(tmp_path: Path) -> None:
     file = tmp_path / "tasks.py"
     file.write_text(TWO)
     for env_id, name in (("A-v1", "One"), ("B-v1", "Two"), ("Plain", "Plain")):
         assert class_in(file, env_id) == f"{file}:{name}"
         assert str(reference_of(info_of(task=env_id, source_file=str(file)))) == f"{file}:{name}"
     assert class_in(file, "C-v1") is None and class_in(tmp_path / "none.py", "A-v1") is None
-    for other in ("tasks.py", str(file.with_suffix(".txt")), str(tmp_path)):
-        assert str(reference_of(info_of(task="A-v1", source_file=other))) == "A-v1"
+    installed = Path(mani_skill.__file__).parent / "envs" / "tasks" / "tabletop" / "pick_cube.py"
+    assert class_in(installed, "PickCube-v1") is not None
+    others = ("tasks.py", str(file.with_suffix(".txt")), str(tmp_path), str(tmp_path / "gone.py"), None)
+    for task, other in (*(("A-v1", other) for other in others), ("PickCube-v1", str(installed))):
+        assert str(reference_of(info_of(task=task, source_file=other))) == task
     file.write_text("def (")
     assert class_in(file, "A-v1") is None
 
 
-def test_options_are_those_of_the_recording() -> None:
-    options = options_of(info_of(pictures="fast", seed=6, env_kwargs={"human_render_camera_configs": {}}), 3)
-    assert (options.num_envs, options.seed, options.pictures) == (3, 6, "fast")
-    assert options.env_kwargs == {"control_mode": "pd_joint_delta_pos"}
+def test_the_env_is_made_with_the_recorded_options_except_those_of_batch_and_rendering() -> None:
+    left_out: dict[str, Any] = {"num_envs": 64, "sim_backend": "gpu", "human_render_camera_configs": {}}
+    left_out |= {"render_device": "cuda:1", "render_mode": "human", "render_backend": "gpu"}
+    kept = {"robot_uids": "panda_wristcam", "obs_mode": "rgb"}
+    recorded = info_of(pictures="fast", seed=6, env_kwargs=left_out | kept)
+    options = options_of(recorded, 3, TaskOptions(rules="warn"))
+    assert (options.num_envs, options.seed, options.pictures, options.rules) == (3, 6, "fast", "warn")
+    assert options.env_kwargs == {**kept, "control_mode": "pd_joint_delta_pos"}
     named = options_of(info_of(seed=-1, env_kwargs={"control_mode": "pd_ee_pose"}), 1)
     assert (named.seed, named.env_kwargs, named.pictures) == (0, {"control_mode": "pd_ee_pose"}, "exact")
     # As older versions recorded the modes of several robots.
     assert options_of(info_of(control_mode="{'panda-0': 'pd_ee_pose'}"), 1).env_kwargs == {}
 
 
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of temporary folders."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
 @pytest.mark.parametrize("main", ["push.py", "/there/push.py"])
-def test_the_recorded_text_keeps_its_folders_and_its_own_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: str
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+def test_the_recorded_text_is_opened_in_a_folder_that_is_removed(temporary: Path, main: str) -> None:
     texts = {"lib/push.py": "x = 1\n", "push.py": TWO, "shapes.py": "SIZE = 1\n"}
     recorded = {str(Path(main).parent / name): text for name, text in texts.items()}
+    recorded[str(Path(main).parent / "../../outside.py")] = "y = 1\n"
     info = info_of(task="B-v1", source_file=main, source=recorded)
-    folder, reference = write_source(info)
-    assert reference == f"{folder / 'push.py'}:Two"
-    found = {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*.py")}
-    assert found == texts
-    shutil.rmtree(folder)
+    with recorded_source(info) as reference:
+        (folder,) = temporary.iterdir()
+        assert reference == f"{folder / 'push.py'}:Two"
+        found = {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*.py")}
+    assert found == {**texts, "outside.py": "y = 1\n"}
+    assert list(temporary.iterdir()) == []
     version = recorded_version(info)
     assert version and version == recorded_version(replace(info, source=dict(reversed(recorded.items()))))
     assert version != recorded_version(replace(info, source={**recorded, main: TWO + "# edited\n"}))
     assert recorded_version(replace(info, source={})) == ""
 
 
-def test_no_folder_is_left_of_a_text_that_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+def test_no_folder_is_left_of_a_text_that_cannot_be_written(temporary: Path) -> None:
     for source in ({"push.py": TWO, "a\0b.py": ""}, {"other.py": TWO}, {}):
-        with pytest.raises(CannotEnterRecording):
-            write_source(info_of(source_file="push.py", source=source))
-    assert list(tmp_path.iterdir()) == []
+        with (
+            pytest.raises(CannotEnterRecording),
+            recorded_source(info_of(source_file="push.py", source=source)),
+        ):
+            pass
+    assert list(temporary.iterdir()) == []
 
 
-def test_a_module_beside_the_task_that_was_not_recorded_is_not_linked(tmp_path: Path) -> None:
-    file = tmp_path / "push.py"
-    file.write_text(TWO)
-    for name in ("hidden.py", "lib.so", "table.csv"):
-        (tmp_path / name).write_text("")
-    names = dict.fromkeys(("hidden.py", "lib.so", "table.csv"), "0" * 12)
-    folder, _ = write_source(info_of(source_file=str(file), source={str(file): TWO}, side_files=names))
-    assert sorted(path.name for path in folder.iterdir()) == ["push.py", "table.csv"]
-    shutil.rmtree(folder)
+def test_only_todays_data_files_within_the_tasks_folder_are_placed_beside_the_recorded_text(
+    tmp_path: Path, temporary: Path
+) -> None:
+    """A Python module or library of that name would run without having been shown to the user."""
+    author = tmp_path / "author"
+    (author / "meshes").mkdir(parents=True)
+    code = ("numpy.py", "lib.so", "json.cpython-311-x86_64-linux-gnu.so")
+    for name in ("push.py", "meshes/part.obj", "table.csv", "../secret", *code):
+        (author / name).write_text(TWO if name == "push.py" else "today's")
+    above = ("../secret", "meshes/../../secret", str(tmp_path / "secret"))
+    names = ("meshes/part.obj", "table.csv", "meshes/deleted.obj", *above, *code)
+    source = {str(author / "push.py"): TWO}
+    info = info_of(
+        source_file=str(author / "push.py"), source=source, side_files=dict.fromkeys(names, "0" * 12)
+    )
+    with recorded_source(info):
+        (folder,) = temporary.iterdir()
+        found = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+        assert found == {"push.py", "table.csv", "meshes", "meshes/part.obj"}
+        assert (folder / "meshes" / "part.obj").read_text() == "today's"
+    assert (author / "meshes" / "part.obj").read_text() == "today's"
