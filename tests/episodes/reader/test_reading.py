@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import pytest
 from rerun.chunk import RrdReader
 
 from tests.drive.episodes import made, write
+from tests.drive.equal import assert_equal
 from tests.drive.waiting import until
 from tests.episodes.library_files import describe
 from workbench.episodes.episode import CameraTrack
@@ -56,10 +56,7 @@ def test_a_recording_that_times_out_is_skipped_and_the_others_are_read(
     first = reader_of(tmp_path, episodes=False)
     found = rows(tmp_path)
     assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
-    assert (
-        found["b"].problem
-        == "b (.json) takes longer to read than 0 s; it is read again when it is opened or changes."
-    )
+    assert found["b"].problem is not None and "b (.json) takes longer to read than 0 s" in found["b"].problem
     assert not psutil.pid_exists(first)
     (tmp_path / "b.json").unlink()
     assert sorted(rows(tmp_path)) == ["a", "c", "d"]
@@ -98,38 +95,12 @@ def test_a_crash_of_the_reader_is_one_bad_row_and_another_reader_continues(tmp_p
     ended.set()
     thread.join()
     assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
-    assert found["b"].problem == (
-        "b (.json) ended the process that reads recordings (it was killed by SIGSEGV); it is read again when it is opened or changes."
-    )
+    assert found["b"].problem is not None and "it was killed by SIGSEGV" in found["b"].problem
 
 
 def test_an_episode_equals_one_read_in_this_process(recorded: Any, tmp_path: Path) -> None:
     path = recorded.episode.write(tmp_path).json
-    here, there = read_episode(path), reading.read_recording(Source(path))
-    assert there.info == here.info and there.segmentation == here.segmentation
-    assert there.action_names == here.action_names and there.broken_files == here.broken_files == ()
-    for name in ("poses", "action", "reward", "terminated", "truncated"):
-        np.testing.assert_array_equal(getattr(there, name), getattr(here, name), strict=True)
-    for name in ("evaluate", "env_states", "obs"):
-        ours, theirs = getattr(here, name), getattr(there, name)
-        assert list(ours) == list(theirs)
-        for key in ours:
-            np.testing.assert_array_equal(theirs[key], ours[key], strict=True)
-    assert here.geometry is not None and there.geometry is not None
-    assert there.geometry.body_names == here.geometry.body_names
-    for theirs, ours in zip(there.geometry.visuals, here.geometry.visuals, strict=True):
-        assert theirs.name == ours.name
-        np.testing.assert_array_equal(theirs.mesh.faces, ours.mesh.faces)
-        np.testing.assert_array_equal(theirs.bodies, ours.bodies)
-    for theirs, ours in zip(there.cameras, here.cameras, strict=True):
-        assert theirs.info.key == ours.info.key
-        np.testing.assert_array_equal(theirs.pose, ours.pose)
-        for modality in ("rgb", "depth", "segmentation"):
-            seen, again = getattr(ours, modality), getattr(theirs, modality)
-            assert (seen is None) == (again is None)
-            if seen is not None:
-                assert len(again) == len(seen) and again.blob(1) == seen.blob(1)
-                np.testing.assert_array_equal(again[1], seen[1], strict=True)
+    assert_equal(reading.read_recording(Source(path)), read_episode(path))
 
 
 def brightness(camera: CameraTrack, index: int) -> int:
@@ -145,9 +116,8 @@ def test_pictures_are_read_after_the_reader_or_the_file_is_gone(tmp_path: Path) 
     reader.kill()
     until(lambda: not reader.is_running() or reader.status() == psutil.STATUS_ZOMBIE, "its end")
     # In another order than before: each is opened again under its own number.
-    assert [brightness(other, 1), brightness(camera, 1), brightness(other, 0)] == pytest.approx(
-        [40, 20, 0], abs=2
-    )
+    shades = [brightness(other, 1), brightness(camera, 1), brightness(other, 0)]
+    assert shades == pytest.approx([40, 20, 0], abs=2)
     for file in tmp_path.iterdir():
         if file.is_file():
             file.unlink()
@@ -164,14 +134,12 @@ def test_recordings_of_many_folders_are_open_with_few_processes(
         return sum(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in found)
 
     before = processes()
-    folders = [tmp_path / str(k) for k in range(3)]
-    opened = [reading.read_recording(Source(write(folder, made(k + 1)))) for k, folder in enumerate(folders)]
+    opened = [reading.read_recording(Source(write(tmp_path / str(k), made(k)))) for k in (1, 2, 3)]
     until(lambda: processes() <= before + reading.MAX_READERS + 1, "the oldest readers have ended")
-    assert [episode.length for episode in opened] == list(range(1, len(folders) + 1))
+    assert [episode.length for episode in opened] == [1, 2, 3]
     # The first reader was replaced, and its pictures are read by a new one.
-    assert [brightness(one.cameras[0], one.length) for one in opened] == pytest.approx(
-        [20 * one.length for one in opened], abs=2
-    )
+    shades = [brightness(one.cameras[0], one.length) for one in opened]
+    assert shades == pytest.approx([20, 40, 60], abs=2)
 
 
 def test_linked_files_and_a_folder_that_was_made_again_are_read(tmp_path: Path) -> None:
@@ -226,11 +194,9 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
         "print('read', flush=True)\n"
         "time.sleep(60)\n"
     )
-    process = subprocess.Popen(
-        python_command("-c", program, str(tmp_path)), env=child_environment(), stdout=subprocess.PIPE
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"read\n"
+    command = python_command("-c", program, str(tmp_path))
+    process = subprocess.Popen(command, env=child_environment(), stdout=subprocess.PIPE)
+    assert process.stdout is not None and process.stdout.readline() == b"read\n"
     family = psutil.Process(process.pid).children(recursive=True)
     assert family
     process.kill()
