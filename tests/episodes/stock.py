@@ -105,10 +105,10 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
         reward=np.array(rewards, dtype=np.float32),
         terminated=np.array(ended),
         truncated=np.array(cut),
-        evaluate=_stacked([state["evaluate"] for state in states]),
+        evaluate=stacked([state["evaluate"] for state in states]),
         cameras=tracks,
-        env_states=_stacked([state["env_states"] for state in states]),
-        obs=_stacked([_flat({"agent": o["agent"], "extra": o["extra"]}) for o in seen]),
+        env_states=stacked([state["env_states"] for state in states]),
+        obs=stacked([flat({"agent": o["agent"], "extra": o["extra"]}) for o in seen]),
     )
     return Recorded(
         episode=episode,
@@ -122,7 +122,7 @@ def _state(base: Any) -> dict[str, Any]:
     return {
         "poses": read_poses(base)[0].copy(),
         "evaluate": {key: value[0].numpy().copy() for key, value in base.evaluate().items()},
-        "env_states": _flat(base.get_state_dict()),
+        "env_states": flat(base.get_state_dict()),
         "camera poses": {
             name: sensor.camera.get_global_pose().raw_pose[0].numpy().copy()
             for name, sensor in base._sensors.items()
@@ -130,18 +130,16 @@ def _state(base: Any) -> dict[str, Any]:
     }
 
 
-def _flat(nested: dict[str, Any], prefix: str = "") -> dict[str, NDArray]:
-    """Env 0 of nested tensors (1, ...)."""
-    flat: dict[str, NDArray] = {}
-    for name, value in nested.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}/")
-        else:
-            flat[prefix + name] = value[0].numpy().copy()
-    return flat
+def flat(nested: Any, prefix: str = "") -> dict[str, NDArray]:
+    """Env 0 of a tensor (1, ...), or of nested ones by their path."""
+    if isinstance(nested, dict):
+        return {
+            key: value for name in nested for key, value in flat(nested[name], f"{prefix}/{name}").items()
+        }
+    return {prefix.lstrip("/"): nested[0].numpy().copy()}
 
 
-def _stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 

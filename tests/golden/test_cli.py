@@ -119,6 +119,9 @@ WRONG_CALLS = {
         "export made --lerobot set --fps 0",
         "export made --lerobot made",
         "export made --lerobot set --cameras gone",
+        "export made --maniskill demos.hdf5",
+        "export made --maniskill taken.h5",
+        "export unsolved --maniskill demos.h5 --only-successes",
     ],
     "view": ["view gone.rrd", "view push.py", "view empty"],
     "help": ["help camera", "help sliders", "help nonsense"],
@@ -136,6 +139,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if file.is_file():
             shutil.copy(file, folder)
     shutil.copytree(GOLDEN / "v1" / "tagged", folder / "made")
+    shutil.copytree(GOLDEN / "v1" / "recovered", folder / "unsolved")
+    (folder / "taken.json").write_text("of the user")
     (folder / "empty").mkdir()
     text = (folder / "push.py").read_text()
     assert "> WANTED" in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,8 +15,8 @@ import pytest
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.utils.wrappers.record import RecordEpisode
 
+from tests.drive.commands import exit_code
 from tests.drive.render_device import RENDER_BACKEND
-from workbench.cli.main import main
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions
@@ -38,16 +37,12 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [one.path for what in (pushed, held) for one in record(what).written]
 
 
-def export(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["export", *map(str, arguments)])
-    return int(ended.value.code or 0)
-
-
 @pytest.mark.slow
-def test_maniskills_dataset_class_loads_the_recorded_episodes(recordings: list[Path], tmp_path: Path) -> None:
+def test_maniskills_dataset_class_and_its_replay_accept_exported_recordings(
+    recordings: list[Path], tmp_path: Path
+) -> None:
     file = tmp_path / "demos.h5"
-    assert export(*recordings, "--maniskill", file, "--only-successes") == 0
+    assert exit_code("export", *recordings, "--maniskill", file, "--only-successes") == 0
     data: Any = ManiSkillTrajectoryDataset(str(file), success_only=True)
     ours = [read_episode(path) for path in recordings[:3]]
     assert data.env_id == "PushCube-v1" and data.env_kwargs["control_mode"] == "pd_ee_delta_pos"
@@ -60,12 +55,6 @@ def test_maniskills_dataset_class_loads_the_recorded_episodes(recordings: list[P
     obs, _ = stock.reset(seed=ours[0].info.seed)
     np.testing.assert_allclose(data.obs[0], obs[0].numpy(), atol=1e-5)
     stock.close()
-
-
-@pytest.mark.slow
-def test_replay_trajectory_accepts_exported_recordings(recordings: list[Path], tmp_path: Path) -> None:
-    file = tmp_path / "demos.h5"
-    assert export(*recordings, "--maniskill", file, "--only-successes") == 0
     command = [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", str(file)]
     done = subprocess.run(
         [*command, "--save-traj", "--use-env-states"], capture_output=True, text=True, timeout=600
@@ -74,39 +63,12 @@ def test_replay_trajectory_accepts_exported_recordings(recordings: list[Path], t
     assert "3/3=100.00% demos saved" in done.stdout
 
 
-def test_an_export_overwrites_no_file(
-    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "demos.json").write_text("mine")
-    assert export(recordings[0], "--maniskill", tmp_path / "demos.h5") == 2
-    assert export(recordings[0], "--maniskill", tmp_path / "demos.hdf5") == 2
-    assert export(recordings[0]) == 2
-    held = tmp_path / "held"
-    held.mkdir()
-    for path in recordings[3].parent.glob(f"{recordings[3].stem}.*"):
-        shutil.copy(path, held)
-    assert export(held, "--maniskill", tmp_path / "none.h5", "--only-successes") == 2
-    printed = capsys.readouterr().err
-    for words in (
-        "exists already; give a file",
-        "must end in .h5",
-        "--lerobot FOLDER or --maniskill FILE.h5",
-        "no episode",
-    ):
-        assert words in printed
-    assert [path.name for path in tmp_path.glob("*.*")] == ["demos.json"]
-
-
-OBSERVED = "PickCube-v1", 7
-"""The observed task and its seed."""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("obs_mode", ["rgb+depth+segmentation", "state+rgb"])
 def test_observed_pictures_are_stored_as_maniskills_recorder_stores_them(
     renderer: None, tmp_path: Path, obs_mode: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    task, seed = OBSERVED
+    task, seed = "PickCube-v1", 7
     actions = np.random.default_rng(0).uniform(-1, 1, (4, 8)).astype(np.float32)
     np.save(tmp_path / "actions.npy", actions)
     for name, pictures in (("seen", True), ("blind", False)):
@@ -119,7 +81,7 @@ def test_observed_pictures_are_stored_as_maniskills_recorder_stores_them(
     for action in actions:
         stock.step(action)
     stock.close()
-    assert export(tmp_path / "seen", "--maniskill", tmp_path / "ours.h5") == 0
+    assert exit_code("export", tmp_path / "seen", "--maniskill", tmp_path / "ours.h5") == 0
     ours, theirs = (obs_of(tmp_path / f"{name}.h5") for name in ("ours", "theirs"))
     assert {name: (one.shape, one.dtype) for name, one in ours.items()} == {
         name: (one.shape, one.dtype) for name, one in theirs.items()
@@ -136,12 +98,12 @@ def test_observed_pictures_are_stored_as_maniskills_recorder_stores_them(
     assert data.obs["sensor_data"]["base_camera"]["rgb"].shape == (4, 128, 128, 3)
 
     # ManiSkill's own file is exported unchanged.
-    assert export(tmp_path / "theirs.h5", "--maniskill", tmp_path / "again.h5") == 0
+    assert exit_code("export", tmp_path / "theirs.h5", "--maniskill", tmp_path / "again.h5") == 0
     for name, values in obs_of(tmp_path / "again.h5").items():
         np.testing.assert_allclose(values, theirs[name], atol=1e-6, err_msg=name)
 
     capsys.readouterr()
-    assert export(tmp_path / "blind", "--maniskill", tmp_path / "blind.h5") == 0
+    assert exit_code("export", tmp_path / "blind", "--maniskill", tmp_path / "blind.h5") == 0
     (blind,) = (tmp_path / "blind").glob("*.json")
     assert blind.stem in capsys.readouterr().err
     assert not any(name.startswith("sensor_data") for name in obs_of(tmp_path / "blind.h5"))

@@ -18,7 +18,9 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from numpy.typing import NDArray
 
 from tests.drive.episodes import Made
+from tests.drive.equal import assert_equal
 from tests.drive.render_device import RENDER_BACKEND
+from tests.episodes.stock import flat, stacked
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.reader.read_episode import read_episode, read_maniskill
@@ -27,27 +29,10 @@ STEPS = 6
 SEED = 4
 
 
-def flat(nested: Any, prefix: str = "") -> dict[str, NDArray]:
-    if isinstance(nested, dict):
-        return {
-            key: value for name in nested for key, value in flat(nested[name], f"{prefix}/{name}").items()
-        }
-    return {prefix.lstrip("/"): nested[0].numpy().copy()}
-
-
-def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-
-
 def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
     """The .h5 of one episode from ManiSkill's wrapper (which asks git for its commit) and from ours."""
     stock: Any = gym.make(task, num_envs=1, render_backend="none", **kwargs)
-    env: Any = RecordEpisode(
-        stock,
-        str(folder / "theirs"),
-        trajectory_name="theirs",
-        save_video=False,
-    )
+    env: Any = RecordEpisode(stock, str(folder / "theirs"), trajectory_name="theirs", save_video=False)
     base = env.unwrapped
     obs, info = env.reset(seed=SEED)
     env.action_space.seed(SEED)
@@ -174,12 +159,8 @@ def test_a_file_of_record_episode_is_read_like_ours(child_process: None, tmp_pat
     theirs, ours = record_both("PickCube-v1", tmp_path, obs_mode="state_dict")
     found, expected = read_maniskill(theirs, "traj_0"), read_episode(ours)
     assert found.geometry is None and found.poses is None and found.cameras == []
-    for name in ("action", "reward", "terminated", "truncated"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    for field in ("env_states", "obs"):
-        assert getattr(found, field).keys() == getattr(expected, field).keys()
-        for name, values in getattr(found, field).items():
-            np.testing.assert_array_equal(values, getattr(expected, field)[name])
+    for name in ("action", "reward", "terminated", "truncated", "env_states", "obs"):
+        assert_equal(getattr(found, name), getattr(expected, name), name)
     np.testing.assert_array_equal(found.evaluate["success"][1:], expected.evaluate["success"][1:])
     assert (found.info.task, found.info.seed, found.info.control_dt) == ("PickCube-v1", SEED, 0.05)
     assert found.info.env_kwargs["obs_mode"] == "state_dict"
