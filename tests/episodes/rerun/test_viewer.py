@@ -37,16 +37,10 @@ def file(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def headless(file: Path) -> Iterator[ViewerClient]:
     """Rerun's viewer without a window. `ViewerClient.spawn` would listen on every address."""
     port = free_port()
-    command = [
-        *rerun_command(),
-        "--headless",
-        "--hide-welcome-screen",
-        "--bind",
-        "127.0.0.1",
-        "--port",
-        str(port),
-    ]
-    process = subprocess.Popen(command, env=quiet_environment(), stderr=subprocess.DEVNULL)
+    options = ["--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port)]
+    process = subprocess.Popen(
+        [*rerun_command(), *options], env=quiet_environment(), stderr=subprocess.DEVNULL
+    )
     try:
         await_port(process, port)
         assert listening(process.pid) == {"127.0.0.1"}
@@ -69,25 +63,12 @@ def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: 
     headless.set_time("step", sequence=5)
     state = headless.get_state()
     (recording,) = state.recordings
-    assert {(t.name, t.start, t.end) for t in recording.timelines} == {
-        ("step", 0, 8),
-        ("sim_time", 0, 400_000_000),
-    }
+    timelines = {(one.name, one.start, one.end) for one in recording.timelines}
+    assert timelines == {("step", 0, 8), ("sim_time", 0, 400_000_000)}
     assert recording.current_timeline == "step"
     views = {view.name: view for view in state.views}
-    assert views.keys() == {
-        "Scene",
-        "base_camera rgb",
-        "base_camera depth",
-        "base_camera segmentation",
-        "hand_camera rgb",
-        "hand_camera depth",
-        "hand_camera segmentation",
-        "Reward",
-        "Evaluate",
-        "Action",
-        "Events",
-    }
+    cameras = {f"{of}_camera {what}" for of in ("base", "hand") for what in ("rgb", "depth", "segmentation")}
+    assert views.keys() == {"Scene", *cameras, "Reward", "Evaluate", "Action", "Events"}
     assert not [report for view in state.views for report in view.reports]
     for name, colours in (("Scene", 100), ("hand_camera rgb", 100), ("base_camera segmentation", 5)):
         picture = tmp_path / f"{name}.png"

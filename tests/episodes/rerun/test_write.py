@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
@@ -95,13 +96,9 @@ def test_the_blueprint_comes_first_in_the_file(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
     path = make_episode(300).write(tmp_path).rrd
+    command = [*rerun_command(), "rrd", "print", os.fspath(path)]
     printed = subprocess.run(
-        [*rerun_command(), "rrd", "print", os.fspath(path)],
-        env=quiet_environment(),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
+        command, env=quiet_environment(), capture_output=True, text=True, check=True, timeout=60
     ).stdout
     blueprint, recording = printed.split("BlueprintActivationCommand")
     assert "Chunk(" in blueprint and "/world" not in blueprint
@@ -134,25 +131,29 @@ def test_episodes_of_one_process_are_separate_recordings_with_equal_content(
         assert verify_rrd(path) is None
 
 
-def test_concurrent_threads_write_complete_files_and_leave_no_threads(
+def test_concurrent_threads_each_write_complete_files_and_leave_no_threads(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
-    def some(number: int) -> list[Path]:
-        episode = make_episode(5)
-        episode.info = dataclasses.replace(episode.info, task=f"Task{number}-v1")
-        return [episode.write(tmp_path / f"{number}").rrd for _ in range(5)]
+    def some(steps: int) -> list[Path]:
+        return [make_episode(steps).write(tmp_path).rrd for _ in range(5)]
 
     def own_threads() -> int:
         names = (Path(task, "comm").read_text() for task in Path("/proc/self/task").iterdir())
         return sum(name.startswith(("ChunkBatcher", "RecordingStream", "rerun-copy")) for name in names)
 
+    some(1)
+    process = psutil.Process()
+    files_open = process.num_fds()
     with ThreadPoolExecutor(4) as pool:
-        paths = [path for done in pool.map(some, range(4)) for path in done]
-    for path in paths:
-        reader = RrdReader(path)
-        assert len(reader.blueprints()) == 1
-        assert len(reader.store()) == len(reader.stream().to_chunks())
+        paths = list(pool.map(some, range(1, 5)))
+    for steps, of_thread in enumerate(paths, 1):
+        for path in of_thread:
+            reader = RrdReader(path)
+            assert len(reader.blueprints()) == 1 and len(reader.store()) == len(reader.stream().to_chunks())
+            assert read_episode(path).length == steps
+    assert len(list(tmp_path.iterdir())) == 3 * 25
     until(lambda: own_threads() == 0, "the threads of rerun's streams have ended")
+    until(lambda: process.num_fds() <= files_open, "all files are closed")
 
 
 def test_a_process_forked_during_writing_does_not_hold_the_file_open(
