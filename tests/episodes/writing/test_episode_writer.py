@@ -83,6 +83,7 @@ def test_invalid_rows_are_refused_and_the_episode_continues(make_episode: Maker,
     track = Track(info, np.arange(4), np.tile(pose, (4, 1)), rgb=np.tile(image, (4, 1, 1, 1)))
     episode = make_episode(cameras=[track])
     first, second, *_ = episode.rows()
+    (picture,) = first.pictures
     writer = episode.writer(tmp_path)
 
     def assert_refused(row: EpisodeRow, why: str, **changes: Any) -> None:
@@ -97,6 +98,9 @@ def test_invalid_rows_are_refused_and_the_episode_continues(make_episode: Maker,
     assert_refused(first, "dtype <U5", evaluate={"phase": np.array("reach")})
     assert_refused(first, "camera nose, which the task does not have", pictures=(other,))
     assert_refused(first, "4 x 2, but the camera is 4 x 3", pictures=(low,))
+    assert_refused(
+        first, "float32", pictures=(dataclasses.replace(picture, segmentation=np.zeros((3, 4), np.float32)),)
+    )
     assert_refused(first, "two pictures of one state", pictures=first.pictures * 2)
     with pytest.raises(ValueError, match="no state yet"):
         make_episode().writer(tmp_path).finish()

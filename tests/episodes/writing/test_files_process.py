@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import shutil
-import signal
 import subprocess
 import sys
 import termios
+import threading
 from array import array
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,21 +36,28 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 
 @pytest.fixture(scope="module")
-def process() -> Iterator[FilesProcess]:
+def shared() -> Iterator[tuple[FilesProcess, psutil.Process]]:
     """A shared process that tests must not kill."""
-    process = started()
-    yield process
+    process, child = started()
+    yield process, child
     process.close()
 
 
-def started() -> FilesProcess:
+@pytest.fixture
+def process(shared: tuple[FilesProcess, psutil.Process]) -> FilesProcess:
+    return shared[0]
+
+
+def started() -> tuple[FilesProcess, psutil.Process]:
+    before = set(psutil.Process().children())
     process = FilesProcess()
+    (child,) = set(psutil.Process().children()) - before
     until(lambda: process.is_ready, "the process has done its imports")
-    return process
+    return process, child
 
 
-def pid_of(process: FilesProcess) -> int:
-    return process._process.pid
+def written(folder: Path, steps: int = 3) -> EpisodeWriter:
+    return appended(folder, made(steps), pictures=False)
 
 
 def unread(process: FilesProcess) -> int:
@@ -99,9 +107,8 @@ def test_the_process_writes_the_same_files_as_a_thread(
     assert by_process.h5.read_bytes() == by_thread.h5.read_bytes()
     assert content(by_process.rrd) == content(by_thread.rrd)
     assert description(by_process.json) == description(by_thread.json)
-    assert {made_here(read_episode(files.json).info) for files in (by_process, by_thread)} == {
-        InstallationSeal.CONTENT
-    }
+    seals = {made_here(read_episode(files.json).info) for files in (by_process, by_thread)}
+    assert seals == {InstallationSeal.CONTENT}
     assert files_in(tmp_path / "process") == [".h5", ".json", ".rrd"]
 
 
@@ -123,65 +130,58 @@ def test_a_write_error_is_reported_as_on_a_thread(tmp_path: Path, process: Files
     messages = []
     for asked in (process, None):
         folder = tmp_path / "here"
-        writer = appended(folder, made(3), pictures=False)
+        writer = written(folder)
         shutil.rmtree(folder)
         with pytest.raises(RecordingError) as error:
             writer.finish(asked)
         writer.discard()
         messages.append(str(error.value))
     assert messages[0] == messages[1] and "here" in messages[0]
-    assert (
-        appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()
-    )  # the process still works
+    assert written(tmp_path).finish(process).json.is_file(), "the process still works"
 
 
 @pytest.mark.slow
-def test_a_process_killed_at_any_moment_leaves_the_episode_exactly_once(tmp_path: Path) -> None:
-    for wait in (0, 0.02):
-        folder, process = tmp_path / str(wait), started()
-        writer = appended(folder, made(20), pictures=True)
-        pid = pid_of(process)
-        killer = subprocess.Popen(
-            [sys.executable, "-c", f"import os, time; input(); time.sleep({wait}); os.kill({pid}, 9)"],
-            stdin=subprocess.PIPE,
-        )
-        assert killer.stdin is not None
-        killer.stdin.write(b"\n")
-        killer.stdin.flush()
-        files = writer.finish(process)
-        killer.communicate()
-        assert read_episode(files.rrd).length == 20
-        assert files_in(folder) == [".h5", ".json", ".rrd"]
-        process.close()
+@pytest.mark.parametrize("wait", [0, 0.02])
+def test_a_process_killed_at_any_moment_leaves_the_episode_exactly_once(tmp_path: Path, wait: float) -> None:
+    process, child = started()
+    writer = appended(tmp_path, made(20), pictures=True)
+    killer = threading.Timer(wait, child.kill)
+    killer.start()
+    files = writer.finish(process)
+    killer.join()
+    assert read_episode(files.rrd).length == 20
+    assert files_in(tmp_path) == [".h5", ".json", ".rrd"]
+    process.close()
 
 
 def test_files_finished_before_a_kill_are_used(tmp_path: Path) -> None:
-    process = started()
+    process, child = started()
     writer = appended(tmp_path, made(3, 2), pictures=False)
     journal_of(writer).finish()
     before = make_files(journal_of(writer).path, header_of(journal_of(writer).path), tmp_path)
-    os.kill(pid_of(process), signal.SIGKILL)
+    child.kill()
     assert writer.finish(process) == before
     assert files_in(tmp_path) == [".h5", ".json", ".rrd"]
     assert not process.is_ready
 
 
-def test_a_journal_in_use_is_not_recovered_by_another_process(tmp_path: Path, process: FilesProcess) -> None:
+def test_a_journal_in_use_is_not_recovered_by_another_process(
+    tmp_path: Path, shared: tuple[FilesProcess, psutil.Process]
+) -> None:
     """The writer's process may be killed meanwhile, which releases the writer's own lock."""
-    writer = appended(tmp_path, made(3), pictures=False)
+    process, child = shared
+    writer = written(tmp_path)
     path = journal_of(writer).path
-    os.kill(pid_of(process), signal.SIGSTOP)
+    child.suspend()
     # Until it has stopped it may still receive the request.
-    stopped = psutil.Process(pid_of(process))
-    until(lambda: stopped.status() == psutil.STATUS_STOPPED, "it has stopped")
-    waiting = EpisodeFinisher()
-    future = waiting._pool.submit(writer.finish, process)
-    until(lambda: unread(process) > 0, "it is asked")
-    writer.close()
-    assert claim(path) is None
-    os.kill(pid_of(process), signal.SIGCONT)
-    assert future.result(30).json.is_file()
-    waiting.close()
+    until(lambda: child.status() == psutil.STATUS_STOPPED, "it has stopped")
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(writer.finish, process)
+        until(lambda: unread(process) > 0, "it is asked")
+        writer.close()
+        assert claim(path) is None
+        child.resume()
+        assert future.result(30).json.is_file()
 
 
 def test_if_no_process_can_be_started_a_thread_writes_the_files(
@@ -197,27 +197,22 @@ def test_if_no_process_can_be_started_a_thread_writes_the_files(
     assert not isinstance(future.result(), str)
 
 
-def written(folder: Path) -> EpisodeWriter:
-    return appended(folder, made(3), pictures=False)
-
-
 @pytest.mark.slow
 def test_the_process_ends_with_the_program_that_started_it(tmp_path: Path) -> None:
     program = (
-        "import os, time\n"
+        "import os, psutil, time\n"
         "from workbench.episodes.writing.files_process import FilesProcess\n"
         "process = FilesProcess()\n"
         "while not process.is_ready: time.sleep(0.01)\n"
-        "print(process._process.pid, flush=True)\n"
+        "print(*[child.pid for child in psutil.Process().children()], flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     pid = int(ended.stdout)
-    until(lambda: not Path(f"/proc/{pid}").exists() or "\nState:\tZ" in status_of(pid), "it has ended too")
+    until(lambda: has_ended(pid), "it has ended too")
 
 
-def status_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/status").read_text()
-    except FileNotFoundError:
-        return "\nState:\tZ"
+def has_ended(pid: int) -> bool:
+    with suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    return True

@@ -28,8 +28,7 @@ CHILD = """
 import sys, time
 from pathlib import Path
 import numpy as np
-from tests.drive.rows import EpisodeRow
-from tests.drive.rows import append
+from tests.drive.rows import EpisodeRow, append
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.envs.camera_data import CameraInfo, Picture
 from workbench.episodes.episode import EpisodeInfo

@@ -20,11 +20,11 @@ from tests.drive.episodes import Made, entries_of, journal_of
 from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.episodes.refused_calls import descriptors, left_open, refused
-from workbench.envs.scene.shapes import Mesh
+from workbench.envs.scene.shapes import Mesh, SceneGeometry
 from workbench.envs.task_drawings import Drawing
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.finish_or_recover import recover, remove_episode
-from workbench.episodes.writing.journal import FOLDER, Journal, JournalEntry
+from workbench.episodes.writing.journal import FOLDER, Journal, JournalEntry, read_visuals, write_scene
 from workbench.episodes.writing.publish import RecordingError
 
 Maker = Callable[..., Made]
@@ -133,22 +133,6 @@ def test_a_journal_without_a_step_is_removed(make_episode: Maker, tmp_path: Path
     assert recover(tmp_path / "nowhere") == []
 
 
-def test_an_episode_is_recovered_without_its_lost_meshes(make_episode: Maker, tmp_path: Path) -> None:
-    episode = make_episode()
-    writer = episode.writer(tmp_path)
-    for row in episode.rows():
-        append(writer, row)
-    journal_of(writer).write()
-    writer.close()
-    scene = next((tmp_path / FOLDER).glob("*.scene"))
-    scene.write_bytes(scene.read_bytes()[:-100])
-    (files,) = recover(tmp_path)
-    found = read_episode(files.rrd)
-    assert found.geometry is not None and found.poses is not None
-    assert found.geometry.visuals == () and found.geometry.body_names == episode.geometry.body_names
-    np.testing.assert_array_equal(found.poses, episode.poses)
-
-
 def test_files_of_another_folder_are_not_taken_for_leftovers(tmp_path: Path) -> None:
     folder, other = tmp_path / "recordings", tmp_path / "other"
     folder.mkdir()
@@ -176,6 +160,17 @@ def lengths(folder: Path) -> dict[str, int]:
     found = {episode.info.id: episode.length for episode in map(read_episode, folder.glob("*.json"))}
     assert len(list(folder.iterdir())) == 3 * len(found), sorted(path.name for path in folder.iterdir())
     return found
+
+
+def test_an_episode_is_recovered_without_its_lost_meshes(make_episode: Maker, tmp_path: Path) -> None:
+    episode = make_episode()
+    scene = left(episode, tmp_path).with_suffix(".scene")
+    scene.write_bytes(scene.read_bytes()[:-100])
+    (files,) = recover(tmp_path)
+    found = read_episode(files.rrd)
+    assert found.geometry is not None and found.poses is not None
+    assert found.geometry.visuals == () and found.geometry.body_names == episode.geometry.body_names
+    np.testing.assert_array_equal(found.poses, episode.poses)
 
 
 @pytest.mark.parametrize("named", [[".h5"], [".h5", ".rrd"]])
@@ -221,38 +216,11 @@ def test_whatever_call_fails_the_next_recovery_completes_each_episode_once(
         assert lengths(folder) == {"0": 2}, call
 
 
-def refused_by_rerun(make_episode: Maker, folder: Path) -> None:
-    episode = make_episode()
-    (visual,) = episode.geometry.visuals
-    flat = dataclasses.replace(visual, mesh=Mesh(np.zeros((3, 2), np.float32), visual.mesh.faces))
-    episode.geometry = dataclasses.replace(episode.geometry, visuals=(flat,))
-    left(episode, folder, id="0")
-
-
-def not_a_state(make_episode: Maker, folder: Path) -> None:
-    changed(left(make_episode(), folder, id="0"), "layout", lambda text: text.replace(b"<f4", b"<f8"))
-
-
-def of_a_missing_camera(make_episode: Maker, folder: Path) -> None:
-    path = left(make_episode(), folder, id="0")
-    changed(path, "acted", lambda text: text, more=JournalEntry("camera/7", 0, bytes(28)))
-
-
-def of_no_drawing(make_episode: Maker, folder: Path) -> None:
-    path = left(make_episode(), folder, id="0")
-    changed(path, "acted", lambda text: text, more=JournalEntry("drawing", 0, b"\x93\xa1a\xa4blob\x90"))
-
-
-def of_another_version(make_episode: Maker, folder: Path) -> None:
-    def further(text: bytes) -> bytes:
-        header = json.loads(text)
-        return json.dumps({**header, "info": json.dumps({**json.loads(header["info"]), "later": 1})}).encode()
-
-    changed(left(make_episode(), folder, id="0"), "header", further)
-
-
-def changed(
-    path: Path, kind: str, change: Callable[[bytes], bytes], more: JournalEntry | None = None
+def change_journal(
+    path: Path,
+    kind: str = "",
+    change: Callable[[bytes], bytes] = lambda text: text,
+    more: JournalEntry | None = None,
 ) -> None:
     """Rewrite the journal with changed values of the entries of a kind, and one entry `more` before the last row."""
     entries = entries_of(path)
@@ -267,14 +235,35 @@ def changed(
     journal.close()
 
 
+def of_a_later_version(text: bytes) -> bytes:
+    header = json.loads(text)
+    return json.dumps({**header, "info": json.dumps({**json.loads(header["info"]), "later": 1})}).encode()
+
+
+def flatten_mesh(journal: Path) -> None:
+    """Store a mesh that rerun refuses."""
+    scene = journal.with_suffix(".scene")
+    (visual,) = read_visuals(scene)
+    flat = dataclasses.replace(visual, mesh=Mesh(np.zeros((3, 2), np.float32), visual.mesh.faces))
+    scene.unlink()
+    write_scene(SceneGeometry(1, (), (), (), (flat,)), scene)
+
+
 @pytest.mark.parametrize(
-    "broken",
-    [refused_by_rerun, not_a_state, of_a_missing_camera, of_no_drawing, of_another_version],
+    "damage",
+    [
+        lambda path: change_journal(path, "layout", lambda text: text.replace(b"<f4", b"<f8")),
+        lambda path: change_journal(path, "header", of_a_later_version),
+        lambda path: change_journal(path, more=JournalEntry("camera/7", 0, bytes(28))),
+        lambda path: change_journal(path, more=JournalEntry("drawing", 0, b"\x93\xa1a\xa4blob\x90")),
+        flatten_mesh,
+    ],
+    ids=["no state", "a later version", "a missing camera", "no drawing", "a flat mesh"],
 )
 def test_an_unrecoverable_journal_is_reported_and_kept_and_the_others_are_recovered(
-    make_episode: Maker, tmp_path: Path, broken: Callable[[Maker, Path], None]
+    make_episode: Maker, tmp_path: Path, damage: Callable[[Path], None]
 ) -> None:
-    broken(make_episode, tmp_path)
+    damage(left(make_episode(), tmp_path, id="0"))
     left(make_episode(4), tmp_path, id="1")
     before = descriptors()
     for _ in range(2):
