@@ -94,7 +94,8 @@ def test_meshes_and_materials_are_read_back_for_each_body(
             assert visual.mesh.uvs is not None and original.mesh.uvs is not None
             np.testing.assert_allclose(visual.mesh.uvs, original.mesh.uvs)
             assert look.texture is not None and look.texture.shape == then.texture.shape
-            assert np.abs(look.texture.astype(int) - then.texture).mean() < 4
+            off = np.abs(look.texture.astype(int) - then.texture).mean()
+            assert off <= (4 if max(then.texture.shape) > VIEWER_TEXELS else 0)
 
 
 def test_rerun_shows_colours_textures_and_names_of_ids(episode: Made, tmp_path: Path) -> None:
@@ -128,12 +129,11 @@ def test_curves_of_one_view_have_names_and_colours_of_their_own(episode: Made, t
     entities = read_rrd(writer.finish().rrd)
 
     def curves(*names: str) -> dict[str, int]:
-        held = [entities[name] for name in names]
-        found = [
-            (list(one["SeriesLines:names"].values[0]), one["SeriesLines:colors"].values[0].tolist())
-            for one in held
-        ]
-        return {name: colour for names, colours in found for name, colour in zip(names, colours, strict=True)}
+        found: dict[str, int] = {}
+        for held in (entities[name] for name in names):
+            shown, colours = held["SeriesLines:names"].values[0], held["SeriesLines:colors"].values[0]
+            found |= dict(zip(shown, colours.tolist(), strict=True))
+        return found
 
     evaluated = curves("/evaluate/success", "/evaluate/xy", "/batch/mean")
     assert list(evaluated) == ["success", "xy[0]", "xy[1]", "mean"] and len(set(evaluated.values())) == 4

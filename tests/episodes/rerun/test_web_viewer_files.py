@@ -1,4 +1,4 @@
-"""The web viewer's files are stored once per version of rerun, completely or not at all; recordings to show are checked."""
+"""The web viewer's files are stored once per version of rerun, completely or not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from workbench.episodes.rerun import viewer
 from workbench.episodes.rerun.viewer import (
     has_screen,
     quiet_environment,
-    resolve_recordings,
     viewer_file,
     viewer_is_cached,
     web_viewer_folder,
@@ -63,18 +62,7 @@ def test_files_that_cannot_be_stored_are_an_error_and_leave_nothing(
     assert viewer_is_cached()
 
 
-def test_only_rrd_files_that_exist_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("a.rrd", "b.json"):
-        Path(name).write_text("")
-    assert resolve_recordings([Path("a.rrd")]) == [tmp_path / "a.rrd"]
-    for paths, error in (
-        ([], ValueError),
-        (["a.rrd", "b.json"], ValueError),
-        (["a.rrd", "c.rrd"], FileNotFoundError),
-    ):
-        with pytest.raises(error):
-            resolve_recordings([Path(path) for path in paths])
+def test_a_screen_is_one_of_x_or_of_wayland() -> None:
     assert has_screen({"DISPLAY": ":0"}) and has_screen({"WAYLAND_DISPLAY": "wayland-0"})
     assert not has_screen({}) and not has_screen({"DISPLAY": ""})
 
