@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from tests.drive.episodes import Made
 from tests.drive.equal import assert_equal
-from tests.drive.render_device import RENDER_BACKEND
 from tests.episodes.stock import flat, stacked
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.episodes.episode import EpisodeInfo
@@ -164,40 +163,6 @@ def test_a_file_of_record_episode_is_read_like_ours(child_process: None, tmp_pat
     np.testing.assert_array_equal(found.evaluate["success"][1:], expected.evaluate["success"][1:])
     assert (found.info.task, found.info.seed, found.info.control_dt) == ("PickCube-v1", SEED, 0.05)
     assert found.info.env_kwargs["obs_mode"] == "state_dict"
-
-
-@pytest.mark.slow
-def test_cameras_of_record_episode_are_read(recorded: Any, tmp_path: Path) -> None:
-    """`recorded` is the same episode as plain arrays."""
-    env: Any = gym.make(
-        "PickCube-v1",
-        num_envs=1,
-        obs_mode="rgb+depth+segmentation",
-        robot_uids="panda_wristcam",
-        render_backend=RENDER_BACKEND,
-        sensor_configs={"width": 96, "height": 96},
-    )
-    env = RecordEpisode(env, str(tmp_path), trajectory_name="theirs", save_video=False)
-    env.reset(seed=recorded.episode.info.seed)
-    for action in recorded.episode.action[:3]:
-        env.step(action)
-    env.close()
-    found = read_maniskill(tmp_path / "theirs.h5", "traj_0")
-    assert found.obs.keys() == recorded.episode.obs.keys()
-    assert [track.info.name for track in found.cameras] == ["base_camera", "hand_camera"]
-    for track, made in zip(found.cameras, recorded.episode.cameras):
-        assert (track.info.width, track.info.height) == (96, 96)
-        assert track.info.fovy == pytest.approx(made.info.fovy, abs=1e-5)
-        np.testing.assert_allclose(track.info.intrinsic, made.info.intrinsic)
-        np.testing.assert_allclose(track.pose[:, :3], made.pose[:4, :3], atol=1e-5)
-        # A quaternion and its negative are one rotation.
-        same = np.abs((track.pose[:, 3:] * made.pose[:4, 3:]).sum(axis=1))
-        np.testing.assert_allclose(same, 1, atol=1e-5)
-        assert track.rgb is not None and track.depth is not None and track.segmentation is not None
-        for state in range(4):
-            assert np.abs(track.rgb[state].astype(int) - made.rgb[state]).mean() < 6
-            np.testing.assert_array_equal(track.segmentation[state], made.segmentation[state])
-            assert np.abs(track.depth[state] - made.depth[state]).max() < 2e-3
 
 
 @pytest.mark.parametrize(("suffix", "lost"), [(".rrd", "poses"), (".h5", "env_states"), (".json", "")])
