@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -37,16 +38,6 @@ def recorded(task: OpenedTask) -> Recorded:
     return record(task, STEPS, [31, 7, 5], reaching(STEPS, N))
 
 
-def assert_continues_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
-    """Assert that the same actions give the same states and rewards, bit for bit."""
-    for t in range(state, STEPS):
-        step = task.env.step(recorded.steps[t + 1].action)
-        now = read_states(task.env.env)
-        for name, rows in now.items():
-            assert np.array_equal(rows[env], recorded.states[t + 1][name][env]), (name, t)
-        assert step.reward[env] == recorded.steps[t + 1].reward[env]
-
-
 @pytest.mark.parametrize("state", [0, 1, 17, STEPS - 3])
 def test_an_env_continues_from_an_entered_state_as_recorded_bit_for_bit(
     task: OpenedTask, recorded: Recorded, state: int
@@ -59,7 +50,11 @@ def test_an_env_continues_from_an_entered_state_as_recorded_bit_for_bit(
     for name, values in recorded.steps[state].evaluate.items():
         # Reward terms belong to an action, and no action was taken.
         assert name.startswith("reward_terms/") or np.array_equal(step.evaluate[name][env], values[env]), name
-    assert_continues_as_recorded(task, recorded, env, state)
+    for t in range(state, STEPS):
+        step = task.env.step(recorded.steps[t + 1].action)
+        for name, rows in read_states(task.env.env).items():
+            assert np.array_equal(rows[env], recorded.states[t + 1][name][env]), (name, t)
+        assert step.reward[env] == recorded.steps[t + 1].reward[env]
 
 
 def test_the_other_envs_continue_undisturbed(task: OpenedTask, recorded: Recorded) -> None:
@@ -86,8 +81,7 @@ def test_all_envs_can_enter_one_state_and_continue_equally(task: OpenedTask, rec
     for t in range(30, STEPS):
         action = np.broadcast_to(recorded.steps[t + 1].action[2], (N, 8)).astype(np.float32)
         task.env.step(action)
-    last = read_states(task.env.env)
-    for name, rows in last.items():
+    for name, rows in read_states(task.env.env).items():
         for env in range(N):
             assert np.array_equal(rows[env], recorded.states[STEPS][name][2])
 
@@ -127,17 +121,6 @@ def test_actions_of_the_wrong_shape_are_reported_and_the_state_is_set(
     assert state_distance(now, run.state(25))[1] < 0.05
 
 
-def test_a_seed_begins_the_same_episode_in_every_env_of_a_batch(task: OpenedTask) -> None:
-    # This includes the robot's initial joint noise, which ManiSkill draws from env 0's generator.
-    task.env.reset(seed=[4], env_idx=[0])
-    first = {name: rows[0].copy() for name, rows in read_states(task.env.env).items()}
-    task.env.step(np.zeros((N, 8), np.float32))
-    task.env.reset(seed=[4], env_idx=[2])
-    again = {name: rows[2] for name, rows in read_states(task.env.env).items()}
-    for name in first:
-        assert np.array_equal(first[name], again[name]), name
-
-
 def test_each_env_begins_its_own_run_and_gets_its_own_state(task: OpenedTask, recorded: Recorded) -> None:
     record(task, 3, [1, 2, 3], reaching(3, N))
     before = {name: rows.copy() for name, rows in read_states(task.env.env).items()}
@@ -148,16 +131,17 @@ def test_each_env_begins_its_own_run_and_gets_its_own_state(task: OpenedTask, re
     begun = begin_run(task.loaded, task.env, runs)
     assert {env: (one.differs, one.missed) for env, one in begun.items()} == {0: (False, {}), 2: (True, {})}
     assert [task.env.episode_seeds[env] for env in (0, 1, 2)] == [5, 2, 31]
-    for wanted in (
+    first, later = (
         {env: run.state(0) for env, run in runs.items()},
         {0: runs[0].state(9), 2: runs[2].state(20)},
-    ):
+    )
+    for wanted in (first, later):
         now = read_states(task.env.env)
         for name, rows in now.items():
             assert np.array_equal(rows[1], before[name][1]), name
             for env, state in wanted.items():
                 np.testing.assert_allclose(rows[env], state[name], atol=1e-6, err_msg=name)
-        step = restore_recorded(task, {0: runs[0].state(9), 2: runs[2].state(20)})
+        step = restore_recorded(task, later)
     assert step.poses.shape[0] == N
     unseeded = begin_run(task.loaded, task.env, {1: replace(recorded.run(1), seed=-1)})
     assert len(unseeded[1].missed) == 1 and unseeded[1].differs
@@ -167,15 +151,13 @@ def test_parts_of_a_state_that_do_not_fit_are_named_and_stay(task: OpenedTask, r
     env, state = task.env.env, recorded.run(1).state(20)
     cube = state["actors/cube"]
     lacking = {name: value for name, value in state.items() if name != "actors/cube"}
+    others = {"actors/other", "articulations/other"}
     for changed, missed in (
         (state, set()),
         (lacking, {"actors/cube"}),
         ({**state, "actors/cube": np.zeros(14, np.float32)}, {"actors/cube"}),
         ({**state, "actors/cube": np.full(13, np.nan, np.float32)}, {"actors/cube"}),
-        (
-            {**state, "actors/other": cube, "articulations/other": cube},
-            {"actors/other", "articulations/other"},
-        ),
+        (state | dict.fromkeys(others, cube), others),
         ({**state, "actors/other": np.full(13, np.nan, np.float32), "controller/arm": cube}, set()),
     ):
         assert state_mismatches(env, 1, changed).keys() == missed
@@ -195,9 +177,8 @@ def test_actions_that_are_no_numbers_are_not_taken(task: OpenedTask, recorded: R
     done: list[int] = []
     _, result = replay_to(task, replace(recorded.run(1), action=action), 10, [0, 2], done.append)
     assert result.way == "restored" and result.missed.keys() == {"the way there"} and done == []
-    now = read_states(task.env.env)
     for env in (0, 2):
-        here = {name: rows[env] for name, rows in now.items()}
+        here = {name: rows[env] for name, rows in read_states(task.env.env).items()}
         assert state_distance(here, recorded.run(1).state(10))[0] < 1e-6
     _, result = replay_to(task, recorded.run(1), 4, [0, 2], done.append)
     assert (result.way, done) == ("re-simulated", [1, 2, 3, 4])
@@ -269,17 +250,12 @@ def test_the_recorded_options_of_the_reset_and_targets_of_controllers_are_restor
 def test_an_error_of_the_task_during_replay_has_its_own_line(tmp_path: Path) -> None:
     text = (TASKS / "push_cube.py").read_text()
     file = tmp_path / "push_cube.py"
-    line = "    def evaluate(self)"
-    assert line in text
     file.write_text(text)
     task = opened(str(file), 2)
     run = record(task, 8, [3, 4]).run(0)
     task.env.close()
-    head, rest = text.split(line, 1)
-    body = rest.split("\n", 1)
-    file.write_text(
-        f"{head}{line}{body[0]}\n        if (self.elapsed_steps > 3).any():\n            1 / 0\n{body[1]}"
-    )
+    wrong = r"\g<0>\n        if (self.elapsed_steps > 3).any():\n            1 / 0"
+    file.write_text(re.sub(r"    def evaluate\(self\).*", wrong, text))
     task = opened(str(file), 2)
     with pytest.raises(TaskError) as raised:
         replay_to(task, run, 6, [0])
