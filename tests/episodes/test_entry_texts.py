@@ -62,53 +62,34 @@ def test_numbers_texts_and_both_are_read_back(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
     number = OtherEntry("float", numbers=np.array(0.5))
-    states: list[Others] = [
-        {"best": OtherEntry("None", ("None",)), "goal": OtherEntry("list", numbers=np.arange(2))},
-        {"best": number, "goal": OtherEntry("list", numbers=np.arange(2))},
-        {"best": number, "goal": OtherEntry("list", numbers=np.arange(2)), "map": OtherEntry("T", ("9",), whole=False)},
-        {"goal": OtherEntry("list", numbers=np.arange(2)), "word": OtherEntry("list", ("b",), per_env=True)},
-    ]  # fmt: skip
+    nothing = OtherEntry("None", ("None",))
+    part, word = OtherEntry("T", ("9",), whole=False), OtherEntry("list", ("b",), per_env=True)
+    changing = [{"best": nothing}, {"best": number}, {"best": number, "map": part}, {"word": word}]
+    states: list[Others] = [{"goal": OtherEntry("list", numbers=np.arange(2)), **one} for one in changing]
     files = write(make_episode(3), tmp_path, states)
     assert files is not None
-    verify_rrd(files.rrd)
+    assert verify_rrd(files.rrd) is None
     episode = read_episode(files.json)
     np.testing.assert_array_equal(episode.batch["best"], [np.nan, 0.5, 0.5, np.nan])
     np.testing.assert_array_equal(episode.batch["goal"], [[0, 1]] * 4)
     assert episode.batch["goal"].dtype.kind == "i"
-    assert episode.other_entries_at(0)["best"] == OtherEntry("None", ("None",))
-    assert episode.other_entries_at(1)["best"].numbers == 0.5
-    assert episode.other_entries_at(2)["map"] == OtherEntry("T", ("9",), whole=False)
-    assert episode.other_entries_at(3)["word"] == OtherEntry("list", ("b",), per_env=True)
-    assert "map" not in episode.other_entries_at(3) and "word" not in episode.other_entries_at(2)
+    found = [episode.other_entries_at(state) for state in range(4)]
+    assert found[0]["best"] == nothing and found[1]["best"].numbers == 0.5
+    assert [one.get("map") for one in found] == [None, None, part, None]
+    assert [one.get("word") for one in found] == [None, None, None, word]
     entities = read_rrd(files.rrd)
     assert {"/batch/best", "/batch/goal"} <= set(entities)
-    log = entities["/logs/evaluate"]["TextLog:text"]
-    assert [value[0] for value in log.values] == [
-        "best: None",
-        "best is no longer returned",
-        "map: 9",
-        "map is no longer returned",
-        "word: b",
-    ]
+    log = [value[0] for value in entities["/logs/evaluate"]["TextLog:text"].values]
+    gone = [f"{name} is no longer returned" for name in ("best", "map")]
+    assert log == ["best: None", gone[0], "map: 9", gone[1], "word: b"]
 
 
 def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Path) -> None:
-    write(
-        make_episode(4),
-        tmp_path,
-        [*({"phase": text_entry(f"{state // 2}")} for state in range(4)), {}],
-        finish=False,
-    )
+    states: list[Others] = [*({"phase": text_entry(f"{state // 2}")} for state in range(4)), {}]
+    write(make_episode(4), tmp_path, states, finish=False)
     (files,) = recover(tmp_path)
     episode = read_episode(files.json)
-    assert episode.info.recovered
-    assert episode.other_entries_at(4) == {}, "the last state has no entries"
-    assert [episode.other_entries_at(state)["phase"].texts for state in range(4)] == [
-        ("0",),
-        ("0",),
-        ("1",),
-        ("1",),
-    ]
+    assert [episode.other_entries_at(state) for state in range(5)] == states
 
 
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -18,7 +18,6 @@ from tests.live.recorded_runs import opened
 from workbench.app.session import Session
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.envs.step_result import OtherEntry, StepResult
-from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.recorded_source import run_of
 from workbench.episodes.replay import replay_to
@@ -54,16 +53,17 @@ def text(entry: OtherEntry | None) -> str | None:
     return None if entry is None else "".join(entry.texts)
 
 
-def check_recorded(episode: Episode, env: int) -> None:
-    """Check the recorded entries of an episode that began with its reset."""
-    assert episode.length == STEPS
+@pytest.mark.parametrize("env", range(N))
+def test_odd_entries_are_recorded_and_read_back(recordings: Path, env: int) -> None:
+    path = sorted(recordings.glob("*.json"))[env]
+    assert verify_rrd(path.with_suffix(".rrd")) is None
+    episode = read_episode(path)
+    assert (episode.length, episode.info.env_index, episode.broken_files) == (STEPS, env, ())
     others: Any = [episode.other_entries_at(state) for state in range(STEPS + 1)]
     assert [text(each["phase"]) for each in others] == ["reach"] * 2 + ["push"] * 4
     assert [each["stage"].numbers for each in others] == [2] * 6
-    assert [text(each["best"]) or float(each["best"].numbers) for each in others] == [
-        *["None"] * 3,
-        *(0.75, 1.0, 1.25),
-    ]
+    best = [text(each["best"]) or float(each["best"].numbers) for each in others]
+    assert best == ["None", "None", "None", 0.75, 1.0, 1.25]
     assert [text(each.get("sometimes")) for each in others] == [None, "now", None, None, "now", None]
     assert text(others[2]["words"]) == f"cube {env}" and others[2]["words"].per_env
     assert text(others[0]["mute"]) == "<Mute, whose repr raises ValueError>"
@@ -84,16 +84,6 @@ def check_recorded(episode: Episode, env: int) -> None:
     np.testing.assert_array_equal(episode.batch["turns"][::2], episode.batch["progress"][::2])
     np.testing.assert_array_equal(episode.evaluate["reward_terms/all"][1:], episode.reward)
     assert np.isfinite(episode.batch["reward_terms/mean"][1:]).all()
-
-
-def test_odd_entries_are_recorded_and_read_back(recordings: Path) -> None:
-    files = sorted(recordings.glob("*.json"))
-    assert len(files) == N
-    for path in files:
-        verify_rrd(path.with_suffix(".rrd"))
-        episode = read_episode(path)
-        check_recorded(episode, episode.info.env_index)
-        assert episode.broken_files == ()
 
 
 @pytest.mark.slow
@@ -130,8 +120,7 @@ def test_the_page_plays_and_records_odd_entries(session: Session, file: Path) ->
     assert view.problem is None and view.step.others["phase"].texts == ("push",)
     wait_until(session, lambda view: view.of(RecordingStatus).episodes_written >= 2, "recordings")
     session.do(PauseRun())
-    rows = session.view()
-    assert rows.problem is None
+    assert session.view().problem is None
     read = [read_episode(path) for path in sorted((file.parent / "of_the_page").glob("*.json"))]
     assert all(text(episode.other_entries_at(2)["phase"]) == "push" for episode in read)
     assert "progress" in read[0].batch
