@@ -14,6 +14,8 @@ from workbench.source.definitions import Project
 from workbench.source.parsed import Trace, TracedValue
 from workbench.source.read_values import DEGREE, trace_call
 
+pytestmark = pytest.mark.usefixtures("clean_process")
+
 HEAD = """\
 import math
 import numpy as np
