@@ -16,11 +16,12 @@ import pytest
 from PIL import Image
 
 from tests.drive.episodes import Made, Track
+from tests.drive.equal import assert_equal
 from tests.drive.rows import append
 from tests.episodes.read_rrd import read_rrd
 from workbench.envs.camera_data import CameraInfo, CameraKind, CameraSettings, MovedCamera
 from workbench.episodes.document import differences_from_source, write_into_description
-from workbench.episodes.episode import Episode
+from workbench.episodes.episode import CameraTrack, Episode
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.read_rows import read_found
 from workbench.episodes.reader.scan import scan_folder
@@ -137,6 +138,11 @@ def test_the_library_and_rerun_show_what_was_recorded(episode: Made, tmp_path: P
     assert int(start) == 1795255207 * 10**9
 
 
+def shades_of(track: CameraTrack) -> list[float]:
+    assert track.rgb is not None
+    return [float(picture.mean()) for picture in track.rgb]
+
+
 def assert_as_recorded(read: Episode, episode: Made, source_file: str) -> None:
     texts = {"push.py": "Made-v1", "parts/lib.py": "x = 1\n"}
     wanted = dataclasses.replace(episode.info, source=texts, source_file=source_file)
@@ -146,14 +152,10 @@ def assert_as_recorded(read: Episode, episode: Made, source_file: str) -> None:
     for name in ("reward", "terminated", "truncated"):
         np.testing.assert_array_equal(getattr(read, name), getattr(episode, name), strict=True)
     for track, original in zip(read.cameras, episode.cameras, strict=True):
-        for field in dataclasses.fields(CameraInfo):
-            now, then = getattr(track.info, field.name), getattr(original.info, field.name)
-            np.testing.assert_array_equal(now, then, err_msg=field.name)
-        np.testing.assert_array_equal(track.frame, original.frame)
+        assert_equal((track.info, track.frame), (original.info, original.frame))
         np.testing.assert_allclose(track.pose, original.pose, atol=1e-6)
-        assert track.rgb is not None and original.rgb is not None and track.depth is None
-        shades = [round(float(track.rgb[k].mean())) for k in range(len(track.rgb))]
-        assert shades == pytest.approx([one.mean() for one in original.rgb], abs=2)
+        assert original.rgb is not None and track.depth is None
+        assert shades_of(track) == pytest.approx([one.mean() for one in original.rgb], abs=2)
 
 
 def test_every_field_is_read_back_with_and_without_the_other_files(
@@ -180,10 +182,8 @@ def test_a_return_that_is_no_number_is_shown_as_that(make_episode: Maker, tmp_pa
 def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
     episode: Made, tmp_path: Path
 ) -> None:
-    for track in episode.cameras:
-        track.info = dataclasses.replace(
-            track.info, settings=settings(0.0 if track.info.name == "eye" else 5.0)
-        )
+    for track, x in zip(episode.cameras, (0.0, 5.0)):
+        track.info = dataclasses.replace(track.info, settings=settings(x))
     writer = episode.writer(tmp_path)
     for state, row in enumerate(episode.rows()):
         if state == 1:
@@ -197,10 +197,8 @@ def test_moved_cameras_are_recorded_with_the_states_from_which_they_were_moved(
         append(writer, dataclasses.replace(row, pictures=row.pictures[::-1]))
     files = writer.finish()
     for track in read_episode(files.json).cameras:
-        assert track.rgb is not None
         first = 20 if track.info.name == "eye" else 100
-        shades = [round(float(track.rgb[k].mean())) for k in range(len(track.rgb))]
-        assert shades == pytest.approx([first + 10 * state for state in track.frame], abs=2)
+        assert shades_of(track) == pytest.approx([first + 10 * state for state in track.frame], abs=2)
         assert track.pose[:, 1].tolist() == pytest.approx([first] * len(track.frame))
     moved = (
         MovedCamera(1, "human", "view", settings(6.0), settings(5.0)),
@@ -255,32 +253,33 @@ def test_an_outcome_is_told_of_the_last_state_and_of_any(
     assert (facts.success, facts.fail, facts.success_once, facts.recovered) == (*last, once[0], True)
     (title,) = read_rrd(files.rrd)["/__properties"]["RecordingInfo:name"].values[0]
     assert title.endswith(f": {outcome}, 3 steps")
-    seen = {name: flag.tolist() for name, flag in read_episode(files.json).flags.items()}
-    assert seen == {name: flag.tolist() for name, flag in evaluate.items()}
+    assert_equal(read_episode(files.json).flags, evaluate)
     for suffix, other in ((".rrd", ".h5"), (".h5", ".rrd")):
         files.json.with_suffix(suffix).rename(tmp_path / "away")
         problem = row_of(tmp_path)[0].problem
         assert problem is not None and f"{files.json.stem}{suffix}" in problem and other not in problem
         if suffix == ".rrd":
             # The file of the states lacks the flags of the first state.
-            seen = {name: flag[1:].tolist() for name, flag in read_episode(files.json).flags.items()}
-            assert seen == {name: flag[1:].tolist() for name, flag in evaluate.items()}
+            flags = read_episode(files.json).flags
+            assert_equal(
+                {name: flag[1:] for name, flag in flags.items()}, {n: f[1:] for n, f in evaluate.items()}
+            )
         (tmp_path / "away").rename(files.json.with_suffix(suffix))
     assert row_of(tmp_path)[0].problem is None
 
 
 @pytest.mark.parametrize(
     ("size", "form", "small"),
-    [((60, 90), "PNG", (60, 90)), ((600, 900), "JPEG", (64, 96)), ((150, 180), "JPEG", (80, 96))],
+    [((60, 90), "PNG", (60, 90)), ((900, 600), "PNG", (96, 64)), ((150, 180), "JPEG", (80, 96))],
 )
 def test_a_thumbnail_of_another_program_is_made_small(
     episode: Made, tmp_path: Path, size: tuple[int, int], form: str, small: tuple[int, int]
 ) -> None:
     files = episode.write(tmp_path / "recordings")
     document: dict[str, Any] = json.loads(files.json.read_bytes())
-    noise = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+    colour = (9, 200, 9, 255) if form == "PNG" else (9, 200, 9)
     content = io.BytesIO()
-    Image.fromarray(noise).save(content, form)
+    Image.new("RGBA" if form == "PNG" else "RGB", size, colour).save(content, form)
     encoded = "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
     document["workbench"]["thumbnail"] = encoded
     files.json.write_text(json.dumps({**document, "workbench_checksum": None}))
@@ -288,3 +287,4 @@ def test_a_thumbnail_of_another_program_is_made_small(
     assert picture is not None
     image = Image.open(io.BytesIO(picture))
     assert image.format == "JPEG" and image.size == small
+    assert np.abs(np.asarray(image).astype(int) - [9, 200, 9]).max() < 12

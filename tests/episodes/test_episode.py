@@ -10,7 +10,6 @@ import pytest
 
 from tests.drive.episodes import made
 from workbench.envs.camera_data import CameraInfo, CameraKind
-from workbench.episodes.columns import TextEntry
 from workbench.episodes.episode import (
     MAX_DEPTH,
     BrokenFile,
@@ -58,39 +57,16 @@ def test_means_are_those_of_the_states_after_the_reset_that_have_the_entry() -> 
     assert episode.means == {"distance": 3, "term": 3, "flag": pytest.approx(1 / 3)}
 
 
-def test_an_entry_is_a_number_where_there_is_one_and_else_its_text() -> None:
-    episode = replace(
-        made(3),
-        batch={"best": np.array([NAN, NAN, 7.0, NAN]), "goal": np.arange(8).reshape(4, 2)},
-        texts={
-            "best": (
-                (0, TextEntry("None", "None", False, True)),
-                (2, None),
-                (3, TextEntry("str", "x", True, False)),
-            )
-        },
-    )
-    found = [episode.other_entries_at(state) for state in range(4)]
-    assert [each["best"].texts for each in found] == [("None",), ("None",), (), ("x",)]
-    assert float(np.asarray(found[2]["best"].numbers)) == 7 and found[0]["best"].numbers is None
-    assert (found[3]["best"].what, found[3]["best"].per_env, found[3]["best"].whole) == ("str", True, False)
-    assert [np.asarray(each["goal"].numbers).tolist() for each in found] == [[0, 1], [2, 3], [4, 5], [6, 7]]
-
-
 @pytest.mark.parametrize(
     ("cameras", "names"),
     [
         ([("human", "eye"), ("sensor", "eye")], ["eye_human", "eye"]),
         ([("sensor", ""), ("human", "a")], ["unnamed", "a"]),
-        (
-            [("human", "a"), ("human", "a"), ("sensor", "a_human")],
-            ["a", "a_human_human", "a_human"],
-        ),
+        ([("human", "a"), ("human", "a"), ("sensor", "a_human")], ["a", "a_human_human", "a_human"]),
     ],
 )
 def test_each_camera_has_a_name_of_its_own(cameras: list[tuple[CameraKind, str]], names: list[str]) -> None:
     eye = np.eye(3, dtype=np.float32)
-    assert len(set(names)) == len(names)
     infos = [CameraInfo(name, kind, 1, 1, 1.0, 0.1, 1.0, eye, None, ()) for kind, name in cameras]
     assert camera_names(infos) == names
 
@@ -115,11 +91,6 @@ def test_sources_of_actions_name_the_step_from_which_they_acted() -> None:
     assert acted_by_text(pairs) == "random; from step 41 on: sliders" and acted_by_text(()) == ""
 
 
-def test_a_task_has_a_reward_unless_its_mode_is_none() -> None:
-    for kwargs, has in (({}, True), ({"reward_mode": "sparse"}, True), ({"reward_mode": "none"}, False)):
-        assert made(1, env_kwargs=kwargs).info.has_reward is has
-
-
 def test_only_so_many_levels_of_lists_and_objects_are_shallow() -> None:
     deep: Any = []
     for _ in range(MAX_DEPTH - 1):
@@ -137,10 +108,8 @@ def test_a_dataset_takes_no_episode_that_is_damaged_and_names_it() -> None:
     def fails(error: Exception) -> Any:
         raise error
 
-    for error, says in (
-        (OSError("no disk"), "^name: no disk$"),
-        (UnreadableRecording("name is cut."), "^name is cut"),
-    ):
+    cut = UnreadableRecording("name is cut.")
+    for error, says in ((OSError("no disk"), "^name: no disk$"), (cut, "^name is cut")):
         with pytest.raises(UnreadableRecording, match=says):
             read_whole("name", lambda error=error: fails(error))
 

@@ -42,13 +42,6 @@ def test_results_are_read_back_as_written(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["results.parquet"]
 
 
-def test_points_are_summarised_best_first() -> None:
-    best, failed = replace(RESULTS, points=RESULTS.points[::1]).summaries()
-    assert (best.index, best.episodes, best.solved, best.solved_at_end, best.mean_return) == (0, 2, 1, 0, 2.0)
-    assert best.means == {"reward_terms/reach": 0.5} and best.rate == 0.5
-    assert (failed.episodes, failed.failed, failed.failure) == (0, 1, "push.py:3: ValueError: no")
-
-
 def test_each_point_is_summarised_by_its_own_episodes_only() -> None:
     nan = math.nan
     values: list[tuple[int, bool | None, bool | None, float | None, dict[str, float]]] = [
@@ -104,6 +97,9 @@ def test_other_programs_read_each_value_of_a_point_as_it_is(
     assert table["set.x"].to_pylist() == [value for value in column for _ in (0, 1)]
     assert table["mean.m"].to_pylist() == [0.5, 0.5, None, None]
     assert clean_results(read_results(tmp_path / "r.parquet")) == results
+
+
+def test_a_value_is_shown_as_written_and_a_text_without_quotes() -> None:
     assert [value_text(text) for text in ('"a b"', "1.5", "true", "[1]", "{")] == [
         "a b",
         "1.5",
