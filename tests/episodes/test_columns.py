@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,21 +12,6 @@ from workbench.envs.step_result import OtherEntry, StepResult
 from workbench.episodes.columns import BatchPacker, assemble, layout_type
 from workbench.record.gather import batch_columns
 
-
-def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:
-    poses = np.zeros((2, 7), dtype=np.float32)
-    held = {name: np.asarray(value) for name, value in evaluate.items()}
-    return EpisodeRow(poses, held, action=np.asarray(action, dtype=np.float32))
-
-
-def through(rows: list[EpisodeRow]) -> dict[str, np.ndarray]:
-    """Pack `rows` and unpack them as columns."""
-    packer = BatchPacker()
-    contents = [packed(one, packer, 2) for one in rows]
-    runs = [np.frombuffer(content, layout_type(layout.text)) for layout, content in contents]
-    return assemble(runs)
-
-
 VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(
     lambda dtype: hnp.arrays(dtype, st.sampled_from([(), (0,), (1,), (3,), (2, 2)]))
 )
@@ -37,27 +20,23 @@ VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(
 @settings(max_examples=60)
 @given(st.lists(st.dictionaries(st.text(max_size=3), VALUE, max_size=3), min_size=1, max_size=8))
 def test_any_rows_are_restored(entries: list[dict[str, np.ndarray]]) -> None:
-    columns = through(
-        [
-            row()
-            if not held
-            else EpisodeRow(np.zeros((2, 7), np.float32), held, action=np.zeros(2, np.float32))
-            for held in entries
-        ]
-    )
-    assert set(columns) == {"poses", "action", "reward", "terminated", "truncated"} | {
-        f"evaluate/{name}" for held in entries for name in held
-    }
-    for name in {name for held in entries for name in held}:
+    poses, action = np.zeros((2, 7), np.float32), np.zeros(2, np.float32)
+    packer = BatchPacker()
+    contents = [packed(EpisodeRow(poses, held, action=action), packer, 2) for held in entries]
+    columns = assemble([np.frombuffer(content, layout_type(layout.text)) for layout, content in contents])
+    names = {name for held in entries for name in held}
+    assert columns.keys() == {
+        "poses", "action", "reward", "terminated", "truncated", *(f"evaluate/{name}" for name in names)
+    }  # fmt: skip
+    for name in names:
         column = columns[f"evaluate/{name}"]
         for index, held in enumerate(entries):
             if name not in held:
                 assert np.isnan(column[index]).all()
             else:
-                value = held[name]
+                value = held[name].reshape(-1)
                 kept = column[index].reshape(-1)
-                same = value.reshape(-1).astype(column.dtype)
-                np.testing.assert_array_equal(kept[: value.size], same)
+                np.testing.assert_array_equal(kept[: value.size], value.astype(column.dtype))
                 assert value.size == kept.size or np.isnan(kept[value.size :]).all()
 
 

@@ -39,13 +39,9 @@ def drawing(
     text: str = "word",
 ) -> Drawing:
     """A drawing of one env: item k is at (items[k], ...)."""
-    shape = (1, len(items), *ITEM_SHAPES[kind])
-    data = np.reshape(items, (1, -1, *[1] * len(ITEM_SHAPES[kind]))) + np.arange(np.prod(shape[2:])).reshape(
-        shape[2:]
-    )
-    return Drawing(
-        kind, data.astype(np.float32).reshape(shape), color, size, (text,) if kind == "text" else ()
-    )
+    shape = ITEM_SHAPES[kind]
+    data = np.add.outer(items, np.arange(np.prod(shape))).reshape(1, len(items), *shape).astype(np.float32)
+    return Drawing(kind, data, color, size, (text,) if kind == "text" else ())
 
 
 KINDS: st.SearchStrategy[DrawingKind] = st.sampled_from(tuple(ITEM_SHAPES))
@@ -95,8 +91,7 @@ def test_rerun_shows_each_drawing_from_the_state_where_it_changes(
     turned = np.array([[[1, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]]], np.float32)
     fixed = {"spawn": Drawing("frames", turned, size=0.2), "way": drawing("arrows", 1.0, 2.0, size=0.4)}
     made.drawn = [
-        {**fixed, "dots": drawing("points", 1.0), "name": drawing("text", 0.0)},
-        {**fixed, "dots": drawing("points", 1.0), "name": drawing("text", 0.0)},
+        *[{**fixed, "dots": drawing("points", 1.0), "name": drawing("text", 0.0)}] * 2,
         {**fixed, "dots": drawing("points", 5.0, 6.0), "edge": drawing("lines", 1.0)},
         {**fixed, "edge": drawing("lines", 1.0)},
     ]
@@ -108,11 +103,9 @@ def test_rerun_shows_each_drawing_from_the_state_where_it_changes(
     assert [len(row) for row in dots.values] == [1, 2, 0]
     np.testing.assert_array_equal(dots.values[1], [[5, 6, 7], [6, 7, 8]])
     np.testing.assert_array_equal(entities["/drawings/points/dots"]["Points3D:radii"].values[0], [0.25])
-    labels = entities["/drawings/text/name"]["Points3D:labels"]
-    assert (
-        labels.values[0] == ["word"]
-        and len(entities["/drawings/text/name"]["Points3D:positions"].values[1]) == 0
-    )
+    name = entities["/drawings/text/name"]
+    assert name["Points3D:labels"].values[0] == ["word"] and len(name["Points3D:positions"].values[1]) == 0
+    assert list(name["Points3D:show_labels"].values[0]) == [True]
     arrows = entities["/drawings/arrows/way"]
     np.testing.assert_array_equal(arrows["Arrows3D:origins"].values[0], [[1, 2, 3], [2, 3, 4]])
     np.testing.assert_array_equal(arrows["Arrows3D:vectors"].values[0], [[3, 3, 3], [3, 3, 3]])
@@ -120,11 +113,7 @@ def test_rerun_shows_each_drawing_from_the_state_where_it_changes(
     np.testing.assert_allclose(strips[:, 0], [[1, 0, 0]] * 3, atol=1e-6)
     np.testing.assert_allclose(strips[:, 1], [[1, 0.2, 0], [0.8, 0, 0], [1, 0, 0.2]], atol=1e-6)
     np.testing.assert_array_equal(entities["/drawings/lines/edge"]["LineStrips3D:strips"].steps, [2])
-    shown = entities["/drawings/text/name"]["Points3D:show_labels"].values[0]
-    assert (
-        list(shown) == [True]
-        and len(entities["/drawings/frames/spawn"]["LineStrips3D:colors"].values[0]) == 3
-    )
+    assert len(entities["/drawings/frames/spawn"]["LineStrips3D:colors"].values[0]) == 3
     made.drawn = [
         {"way": drawing("frames", 1.0, size=size), "a": drawing("text", 1.0, text="")}
         for size in (1, 2, 1, 1)

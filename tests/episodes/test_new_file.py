@@ -17,21 +17,20 @@ def write(path: Path, content: bytes = b"whole") -> None:
         temporary.write_bytes(content)
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+@pytest.fixture(params=[True, False], ids=["links", "no links"])
+def links(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether the file system has hard links."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if not request.param:
+        monkeypatch.setattr(os, "link", refuse)
+    return request.param
 
 
 @pytest.mark.parametrize("then", [0, errno.EROFS])
-@pytest.mark.parametrize("links", [True, False])
-def test_whatever_call_fails_the_file_is_complete_or_absent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, then: int
-) -> None:
-    if not links:
-
-        def refuse(*_: object) -> None:
-            raise OSError(errno.EPERM, "Operation not permitted")
-
-        monkeypatch.setattr(os, "link", refuse)
+def test_whatever_call_fails_the_file_is_complete_or_absent(tmp_path: Path, links: bool, then: int) -> None:
     with refused() as calls:
         write(tmp_path / "0" / "a.mp4")
     assert {call.split()[0] for call in calls} >= {"mkdir", "fsync", "link" if links else "replace"}
@@ -52,18 +51,11 @@ def test_whatever_call_fails_the_file_is_complete_or_absent(
         assert then or call.startswith("unlink") or set(left) <= {path}, call
 
 
-@pytest.mark.parametrize("links", [True, False])
-def test_a_file_that_appeared_meanwhile_is_not_overwritten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
-) -> None:
-    if not links:
-        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EPERM, "no links")))
+def test_a_file_that_appeared_meanwhile_is_not_overwritten(tmp_path: Path, links: bool) -> None:
     path = tmp_path / "a.mp4"
-    with pytest.raises(FileExistsError, match="is not overwritten"):
-        with new_file(path) as temporary:
-            temporary.write_bytes(b"ours")
-            path.write_bytes(b"of another")
-    assert files_of(tmp_path) == {"a.mp4": b"of another"}
+    with pytest.raises(FileExistsError, match="is not overwritten"), new_file(path) as temporary:
+        temporary.write_bytes(b"ours")
+        path.write_bytes(b"of another")
     with pytest.raises(FileExistsError, match="is not overwritten"):
         write(path)
-    assert files_of(tmp_path) == {"a.mp4": b"of another"}
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a.mp4": b"of another"}

@@ -86,27 +86,12 @@ def test_a_value_of_the_right_type_is_kept_and_any_other_is_unknown(
 
 
 def test_all_texts_and_numbers_of_a_row_are_cleaned() -> None:
-    wild: dict[str, Any] = dict.fromkeys(
-        (
-            "task",
-            "uid",
-            "copy_of",
-            "control_mode",
-            "acted_by",
-            "source_hash",
-            "trajectory",
-            "note",
-            "problem",
-        ),
-        "a\nb",
+    texts = dict.fromkeys(
+        "task uid copy_of control_mode acted_by source_hash trajectory note problem".split(), "a\nb"
     )
-    wild |= {"seed": -1, "env_index": "2", "length": 4.0, "written": math.inf, "total_reward": math.nan}
-    cleaned = clean_facts(Facts("workbench", **wild, tags=("a\tb",)))
-    assert all(
-        getattr(cleaned, name) == "a b"
-        for name in wild
-        if isinstance(wild[name], str) and name != "env_index"
-    )
+    wild: dict[str, Any] = {"env_index": "2", "length": 4.0, "written": math.inf, "total_reward": math.nan}
+    cleaned = clean_facts(Facts("workbench", **texts, **wild, seed=-1, tags=("a\tb",)))
+    assert {getattr(cleaned, name) for name in texts} == {"a b"}
     assert (cleaned.seed, cleaned.env_index, cleaned.length, cleaned.written) == (None, None, 4, None)
     assert cleaned.tags == ("a b",) and cleaned.total_reward is not None and math.isnan(cleaned.total_reward)
     assert clean_facts(Facts("workbench")) == Facts("workbench")
@@ -123,16 +108,8 @@ def test_all_texts_and_numbers_of_a_row_are_cleaned() -> None:
 def test_a_row_names_what_its_reader_opens(
     kind: RecordingKind, files: tuple[str, ...], part: str | None, read: str, as_kind: str, stem: str
 ) -> None:
-    row = LibraryRow(
-        kind,
-        trajectory=part,
-        written=60.0,
-        id="1",
-        name="its name",
-        place=("", 0),
-        paths=tuple(map(Path, files)),
-        size=1,
-    )
+    identity: dict[str, Any] = {"id": "1", "name": "its name", "place": ("", 0), "size": 1}
+    row = LibraryRow(kind, trajectory=part, written=60.0, paths=tuple(map(Path, files)), **identity)
     assert row.source == Source(Path(read), part, "1", "its name")
     assert (row.source.kind, row.source.stem) == (as_kind, stem)
     assert row.date == datetime.datetime(1970, 1, 1, 0, 1, tzinfo=datetime.timezone.utc)

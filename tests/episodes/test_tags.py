@@ -65,10 +65,8 @@ def test_notes_of_one_trajectory_leave_those_of_the_others(tmp_path: Path) -> No
     assert read_notes(path) == {"traj_0": (("tag 0",), "same"), "traj_2": (("tag 2",), "same")}
     write_notes(path, None, (), "of the whole file")
     assert read_notes(path)[""] == ((), "of the whole file")
-    for name in ("traj_0", "traj_2", None):
+    for name in ("traj_0", "traj_2", None, "traj_0"):
         write_notes(path, name, (), "")
-    assert os.listdir(tmp_path) == []
-    write_notes(path, "traj_0", (), "")
     assert os.listdir(tmp_path) == []
 
 

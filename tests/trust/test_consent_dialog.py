@@ -87,9 +87,8 @@ def test_enter_in_a_newly_opened_dialog_runs_nothing(dialog: TrustDialog, panels
     future = asked(dialog, replace(PLAIN, more=2))
     window_with(panels, "/home/me/push.py")
     others = "Don't run the other 2 either"
-    assert [one.text for one in panels.buttons()] == [DO_NOT, others, ONCE, ALWAYS], (
-        "the first button has the focus"
-    )
+    first_has_focus = [DO_NOT, others, ONCE, ALWAYS]
+    assert [one.text for one in panels.buttons()] == first_has_focus
     panels.press(others)
     assert future.result(20) is Consent.NONE
 
@@ -158,14 +157,9 @@ def test_the_dialog_shows_the_code_that_would_run_escaped() -> None:
     dialog_html = question_html(TrustQuestion("Push-v1", False, (evil, *many), ("<b>",)))
     assert "<script>" not in dialog_html and "<b><" not in dialog_html and "&lt;script&gt;.py" in dialog_html
     assert "&lt;/pre&gt;" in dialog_html and "\\u202e" in dialog_html, "the text is escaped"
-    assert all(
-        one.name in dialog_html and one.hash in dialog_html and one.text in dialog_html for one in many
-    )
-    assert (
-        "It imports these modules next to it (300)" in dialog_html
-        and "trusted" not in dialog_html
-        and "every save" not in dialog_html
-    )
+    assert all(part in dialog_html for one in many for part in (one.name, one.hash, one.text))
+    assert "It imports these modules next to it (300)" in dialog_html
+    assert "trusted" not in dialog_html and "every save" not in dialog_html
     held = (CodeFile("push.py", "0" * 12, ""), HELPER)
     dialog_html = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
     assert "&lt;i&gt;Push" in dialog_html
