@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -41,8 +40,10 @@ def slow_json(path: Path) -> None:
     path.write_text("[" + "[0,1,2,3,4,5,6,7,8,9]," * 1_500_000 + "0]")
 
 
-def reader_of(folder: Path, episodes: bool) -> int:
-    return reading._readers[folder, episodes]._pid
+def newest_reader() -> psutil.Process:
+    """The reader that was started last; the fork server is the parent of all."""
+    servers = [one for one in psutil.Process().children() if "episodes.reader" in " ".join(one.cmdline())]
+    return max((reader for one in servers for reader in one.children()), key=psutil.Process.create_time)
 
 
 def test_a_recording_that_times_out_is_skipped_and_the_others_are_read(
@@ -53,11 +54,11 @@ def test_a_recording_that_times_out_is_skipped_and_the_others_are_read(
     rows(tmp_path)
     slow_json(tmp_path / "b.json")
     monkeypatch.setattr(reading, "ROW_SECONDS", 0.2)
-    first = reader_of(tmp_path, episodes=False)
+    first = newest_reader()
     found = rows(tmp_path)
     assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
     assert found["b"].problem is not None and "b (.json) takes longer to read than 0 s" in found["b"].problem
-    assert not psutil.pid_exists(first)
+    assert not first.is_running()
     (tmp_path / "b.json").unlink()
     assert sorted(rows(tmp_path)) == ["a", "c", "d"]
 
@@ -81,12 +82,12 @@ def test_a_crash_of_the_reader_is_one_bad_row_and_another_reader_continues(tmp_p
     ended = threading.Event()
 
     def crash() -> None:
-        seen: list[int] = []
+        seen: list[psutil.Process] = []
         # The first crash is ignored: the recording may not be its cause.
         while len(seen) < 2 and not ended.wait(0.05):
-            victim = reader_of(tmp_path, episodes=False)
-            if victim not in seen and psutil.Process(victim).cpu_times().user > 0.1:
-                os.kill(victim, signal.SIGSEGV)
+            victim = newest_reader()
+            if victim not in seen and victim.cpu_times().user > 0.1:
+                victim.send_signal(signal.SIGSEGV)
                 seen.append(victim)
 
     thread = threading.Thread(target=crash)
@@ -112,7 +113,7 @@ def test_pictures_are_read_after_the_reader_or_the_file_is_gone(tmp_path: Path) 
     path = write(tmp_path, made(4))
     (camera,) = reading.read_recording(Source(path)).cameras
     (other,) = reading.read_recording(Source(write(tmp_path, made(2, speed=1), every=2))).cameras
-    reader = psutil.Process(reader_of(tmp_path, episodes=True))
+    reader = newest_reader()
     reader.kill()
     until(lambda: not reader.is_running() or reader.status() == psutil.STATUS_ZOMBIE, "its end")
     # In another order than before: each is opened again under its own number.

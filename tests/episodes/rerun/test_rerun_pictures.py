@@ -89,11 +89,8 @@ def test_pictures_of_several_chunks_are_read_in_any_order(
     assert all((segmentation[i] == 1).all() for i in order)
 
 
-def test_the_file_is_closed_when_the_recording_is_freed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_file_is_closed_when_the_recording_is_freed(tmp_path: Path) -> None:
     rrd = write(tmp_path, made(9)).with_suffix(".rrd")
-    monkeypatch.setattr(read, "_chunk_cache", read._ChunkCache())
     episode = read_episode(rrd)
     assert str(rrd) in descriptors()
     del episode
