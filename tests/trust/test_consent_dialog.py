@@ -35,6 +35,18 @@ def asked(
     return future
 
 
+def shown(
+    dialog: TrustDialog,
+    panels: Panels,
+    question: TrustQuestion = PLAIN,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Future[Consent]:
+    """Ask, and wait for the window."""
+    future = asked(dialog, question, stopped)
+    window_with(panels, question.files[0].name)
+    return future
+
+
 def window_with(panels: Panels, text: str) -> None:
     until(lambda: text in panels.html() and panels.shows(ALWAYS), f"the window with {text}")
 
@@ -57,8 +69,7 @@ def dialog(panels: Panels) -> TrustDialog:
 def test_a_press_answers_and_closes_the_dialog(
     dialog: TrustDialog, panels: Panels, label: str, answer: Consent
 ) -> None:
-    future = asked(dialog)
-    window_with(panels, "/home/me/push.py")
+    future = shown(dialog, panels)
     panels.press(label)
     assert future.result(20) is answer
     assert not panels.shows(label) and panels.html() == ""
@@ -67,16 +78,14 @@ def test_a_press_answers_and_closes_the_dialog(
 def test_only_the_first_answer_counts_and_none_before_its_question(
     dialog: TrustDialog, panels: Panels
 ) -> None:
-    future = asked(dialog)
-    window_with(panels, "/home/me/push.py")
+    future = shown(dialog, panels)
     refuse, allow = (panels.button(label).command for label in (DO_NOT, ALWAYS))
     assert refuse is not None and allow is not None
     panels.do(refuse)
     panels.do(allow)
     assert future.result(20) is Consent.NO
     panels.do(allow)
-    second = asked(dialog, about("/home/me/other.py"))
-    window_with(panels, "/home/me/other.py")
+    second = shown(dialog, panels, about("/home/me/other.py"))
     panels.do(allow)
     assert not second.done() and len(panels.client.notices) == 3
     panels.press(DO_NOT)
@@ -84,11 +93,10 @@ def test_only_the_first_answer_counts_and_none_before_its_question(
 
 
 def test_enter_in_a_newly_opened_dialog_runs_nothing(dialog: TrustDialog, panels: Panels) -> None:
-    future = asked(dialog, replace(PLAIN, more=2))
-    window_with(panels, "/home/me/push.py")
+    future = shown(dialog, panels, replace(PLAIN, more=2))
     others = "Don't run the other 2 either"
-    first_has_focus = [DO_NOT, others, ONCE, ALWAYS]
-    assert [one.text for one in panels.buttons()] == first_has_focus
+    # The first button has the focus.
+    assert [one.text for one in panels.buttons()] == [DO_NOT, others, ONCE, ALWAYS]
     panels.press(others)
     assert future.result(20) is Consent.NONE
 
@@ -107,8 +115,7 @@ def test_questions_are_shown_one_after_the_other(dialog: TrustDialog, panels: Pa
 
 def test_escape_answers_no_to_the_shown_question_only(dialog: TrustDialog, panels: Panels) -> None:
     assert not dialog.say_no()
-    first, stop = asked(dialog, about("a.py")), threading.Event()
-    window_with(panels, "a.py")
+    first, stop = shown(dialog, panels, about("a.py")), threading.Event()
     withdrawn, last = asked(dialog, about("b.py"), stop.is_set), asked(dialog, about("c.py"))
     stop.set()
     assert withdrawn.result(20) is Consent.NO
@@ -130,8 +137,7 @@ def test_long_texts_are_cut_and_the_page_says_how_much_is_left_out(monkeypatch: 
 
 
 def test_a_rebuilt_page_shows_the_question_again(dialog: TrustDialog, panels: Panels) -> None:
-    future = asked(dialog)
-    window_with(panels, "/home/me/push.py")
+    future = shown(dialog, panels)
     with panels.server.atomic():
         panels.server.gui.reset()
     window_with(panels, "/home/me/push.py")
@@ -141,12 +147,10 @@ def test_a_rebuilt_page_shows_the_question_again(dialog: TrustDialog, panels: Pa
 
 def test_a_withdrawn_question_or_one_during_close_is_answered_no(dialog: TrustDialog, panels: Panels) -> None:
     stop = threading.Event()
-    future = asked(dialog, PLAIN, stop.is_set)
-    window_with(panels, "/home/me/push.py")
+    future = shown(dialog, panels, PLAIN, stop.is_set)
     stop.set()
     assert future.result(20) is Consent.NO and not panels.shows(ALWAYS)
-    future = asked(dialog)
-    window_with(panels, "/home/me/push.py")
+    future = shown(dialog, panels)
     dialog.close()
     assert future.result(20) is Consent.NO and asked(dialog).result(20) is Consent.NO
 
