@@ -277,9 +277,10 @@ def test_a_thumbnail_of_another_program_is_made_small(
 ) -> None:
     files = episode.write(tmp_path / "recordings")
     document: dict[str, Any] = json.loads(files.json.read_bytes())
-    colour = (9, 200, 9, 255) if form == "PNG" else (9, 200, 9)
+    noise = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+    given = Image.fromarray(noise) if form == "JPEG" else Image.new("RGBA", size, (9, 200, 9, 255))
     content = io.BytesIO()
-    Image.new("RGBA" if form == "PNG" else "RGB", size, colour).save(content, form)
+    given.save(content, form)
     encoded = "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
     document["workbench"]["thumbnail"] = encoded
     files.json.write_text(json.dumps({**document, "workbench_checksum": None}))
@@ -287,4 +288,4 @@ def test_a_thumbnail_of_another_program_is_made_small(
     assert picture is not None
     image = Image.open(io.BytesIO(picture))
     assert image.format == "JPEG" and image.size == small
-    assert np.abs(np.asarray(image).astype(int) - [9, 200, 9]).max() < 12
+    assert form == "JPEG" or np.abs(np.asarray(image).astype(int) - [9, 200, 9]).max() < 12

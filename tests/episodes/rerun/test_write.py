@@ -146,6 +146,7 @@ def test_concurrent_threads_each_write_complete_files_and_leave_no_threads(
     files_open = process.num_fds()
     with ThreadPoolExecutor(4) as pool:
         paths = list(pool.map(some, range(1, 5)))
+    until(lambda: process.num_fds() <= files_open, "all files are closed", 20)
     for steps, of_thread in enumerate(paths, 1):
         for path in of_thread:
             reader = RrdReader(path)
@@ -153,7 +154,6 @@ def test_concurrent_threads_each_write_complete_files_and_leave_no_threads(
             assert read_episode(path).length == steps
     assert len(list(tmp_path.iterdir())) == 3 * 25
     until(lambda: own_threads() == 0, "the threads of rerun's streams have ended")
-    until(lambda: process.num_fds() <= files_open, "all files are closed")
 
 
 def test_a_process_forked_during_writing_does_not_hold_the_file_open(
