@@ -13,14 +13,23 @@ from workbench.trust import store as trust
 from workbench.trust.store import STORE_FILE, TrustStore
 
 
-def content(text: str = "a") -> TaskContent:
-    return TaskContent("/author/push.py", {"/author/push.py": text})
+def content(text: str = "a", file: str = "/author/push.py") -> TaskContent:
+    return TaskContent(file, {file: text})
 
 
 @pytest.fixture(autouse=True)
 def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     return tmp_path / "workbench" / STORE_FILE
+
+
+def test_once_lasts_until_the_program_ends(store: Path) -> None:
+    kept = TrustStore()
+    kept.trust_once(content("one"))
+    kept.trust_once(content("two"), followed=True)
+    assert kept.trusts(content("one")) and not kept.follows(content("one"))
+    assert kept.follows(content("two")) and not kept.follows(content("two", "/other/push.py"))
+    assert not TrustStore().trusts(content("one")) and not store.exists()
 
 
 @pytest.mark.parametrize(
