@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.drive.episodes import appended, made
 from tests.drive.scenes import camera, description, table_scene
 from tests.drive.session import moment
 from tests.record.gathered import assert_rows, columns_of, pictures_of
@@ -17,6 +19,7 @@ from workbench.envs.step_result import OtherEntry
 from workbench.envs.task_drawings import Drawing
 from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.episode_writer import EpisodeFiles
 from workbench.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode, episode_info
 from workbench.task.description import Stepped
 
@@ -252,7 +255,14 @@ def test_the_info_is_that_of_the_task(tmp_path: Path) -> None:
     assert info.acted_by == ((0, "zero"),) and not episode_info(task, 1, 9).acted_by
 
 
-def test_the_finisher_counts_what_is_written_and_tells_of_each(tmp_path: Path) -> None:
+class Panic(BaseException):
+    """Like a panic in rerun's Rust code: not an `Exception`."""
+
+
+@pytest.mark.parametrize("error", [OSError, Panic])
+def test_the_finisher_counts_what_is_written_and_tells_of_each(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
     batch = Batch(tmp_path, (0, 1))
     batch.reset(0, 1)
     batch.step()
@@ -263,17 +273,31 @@ def test_the_finisher_counts_what_is_written_and_tells_of_each(tmp_path: Path) -
     def refuse_second(files: Any) -> None:
         then.append(files.json)
         if len(then) == 2:
-            raise OSError("no network")
+            raise error("no network")
 
     finisher = EpisodeFinisher(
         lambda: changes.append((finisher.finished.count, finisher.finished.problem)), then=refuse_second
     )
     one, two = [finisher.finish(episode) for episode in batch.ended]
-    made = one.result()
-    assert not isinstance(made, str) and made.json == then[0]
-    assert isinstance(two.result(), str) and "no network" in str(two.result())
+    files = one.result(60)
+    assert not isinstance(files, str) and files.json == then[0]
+    assert isinstance(two.result(60), str) and "no network" in str(two.result())
     finisher.close()
     assert [count for count, _ in changes] == [1, 1] and changes[0][1] is None
     assert changes[1][1] == two.result() and finisher.waiting == 0
-    size = sum(file.stat().st_size for file in (made.rrd, made.h5, made.json))
-    assert (finisher.finished.bytes_written, finisher.finished.last) == (size, made)
+    size = sum(file.stat().st_size for file in (files.rrd, files.h5, files.json))
+    assert (finisher.finished.bytes_written, finisher.finished.last) == (size, files)
+
+
+def test_the_error_of_one_episode_is_not_lost_when_the_next_is_written(tmp_path: Path) -> None:
+    folders = (tmp_path / "gone", tmp_path / "there")
+    episodes = [
+        GatheredEpisode(appended(folder, made(3), pictures=False), env=env, seed=0)
+        for env, folder in enumerate(folders)
+    ]
+    shutil.rmtree(folders[0])
+    finisher = EpisodeFinisher()
+    lost, kept = (finisher.finish(episode).result(60) for episode in episodes)
+    finisher.close()
+    assert isinstance(lost, str) and "env 0" in lost and "gone" in lost
+    assert isinstance(kept, EpisodeFiles) and kept.rrd.is_file()
