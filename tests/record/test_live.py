@@ -1,4 +1,4 @@
-"""Recording live, from the next reset, and afterwards from the history gives the same files."""
+"""Recording live, and afterwards from the history, gives the same files."""
 
 from __future__ import annotations
 
@@ -22,16 +22,12 @@ from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
 from workbench.episodes.lerobot.format import WORKBENCH_FILE
 from workbench.episodes.maniskill.export import export_maniskill
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.live.commands import Step
-from workbench.live.events import EnvsReset
-from workbench.live.view import SessionView
 from workbench.record.commands import StopRecording
 from workbench.record.saving_state import SaveWanted
 from workbench.record.state import RecordingStatus, RecordingWanted
 from workbench.task.load import load_task
 
 STEPS = 4
-EYE = "eye=[0.45, 0, 0.6]"
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +39,11 @@ def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> It
         yield session
 
 
-def elapsed(view: SessionView) -> int:
-    return -1 if view.step is None else int(view.step.elapsed_steps[0])
+def begin_recording(session: Session, envs: tuple[int, ...] | None = None) -> None:
+    """Begin to record these envs (all if None), and wait for their reset."""
+    session.dispatch(RecordingWanted(envs))
+    begun = lambda status: status.active and status.waiting == 0  # noqa: E731
+    wait_until(session, lambda view: begun(view.of(RecordingStatus)), "the recording")
 
 
 def written(session: Session, count: int) -> list[Episode]:
@@ -81,12 +80,7 @@ def assert_same(one: Episode, other: Episode) -> None:
 
 @pytest.mark.slow
 def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) -> None:
-    session.dispatch(RecordingWanted())
-    wait_until(
-        session,
-        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
-        "the recording",
-    )
+    begin_recording(session)
     step(session, STEPS)
     view = wait_until(session, lambda view: view.of(RecordingStatus).steps == 2 * STEPS, "the steps")
     assert view.of(RecordingStatus).bytes_written > 0
@@ -114,142 +108,6 @@ def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) 
 
 
 @pytest.mark.slow
-def test_the_previous_episode_can_be_saved(session: Session) -> None:
-    count = session.view().of(RecordingStatus).episodes_written
-    for steps in (3, 1):
-        session.dispatch(EnvsReset())
-        for made in range(steps):
-            session.change(action_source="random" if made == 0 else "hold")
-            session.do(Step())
-        wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
-    session.dispatch(SaveWanted((0,), before=True))
-    kept = written(session, count + 1)[-1]
-    assert kept.length == 3 and kept.info.env_index == 0
-    # Without a recording both envs were reset together: env 0 starts as it would alone, env 1 does not.
-    message = session.view().of(RecordingStatus).saving.message
-    assert kept.info.seed == 5 and "seed" not in message
-    session.dispatch(SaveWanted((1,), before=True))
-    kept = written(session, count + 2)[-1]
-    assert kept.info.env_index == 1 and kept.info.seed == -1
-    message = (
-        wait_until(
-            session, lambda view: bool(view.of(RecordingStatus).saving.message), "the result of saving"
-        )
-        .of(RecordingStatus)
-        .saving.message
-    )
-    assert "without a seed" in message
-    assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
-    session.change(action_source="random")
-
-
-@pytest.mark.slow
-def test_an_episode_of_an_earlier_version_is_saved_with_its_own_source(session: Session) -> None:
-    count = session.view().of(RecordingStatus).episodes_written
-    session.dispatch(EnvsReset())
-    wait_until(session, lambda view: elapsed(view) == 0, "a reset")
-    step(session, 2)
-    played = wait_until(session, lambda view: elapsed(view) == 2, "the steps")
-    version = played.task
-    assert version is not None and version.file is not None and played.step is not None
-    file = Path(version.file)
-    text = file.read_text()
-    shown = camera(session, BASE).now
-    assert shown is not None and text.count(EYE) == 1
-    file.write_text(text.replace("= 3\n", "= 4\n").replace(EYE, "eye=[0.4, 0, 0.6]"))
-    wait_until(
-        session, lambda view: view.task is not None and view.task.source_hash != version.source_hash, "it"
-    )
-    session.dispatch(SaveWanted((0,)))
-    kept = written(session, count + 1)[-1]
-    assert kept.info.source_hash == version.source_hash
-    assert list(kept.info.source.values()) == list(version.source.values())
-    np.testing.assert_array_equal(kept.reward[-1], played.step.reward[0])
-    assert "an earlier version" in session.view().of(RecordingStatus).saving.message
-    # The camera placement of the pictures, which the episode's source does not hold.
-    now = session.view().task
-    assert now is not None and kept.info.observed_by == now.source_hash
-    ((moved, used, in_file),) = [(m.name, m.used, m.in_file) for m in kept.info.moved_cameras]
-    assert (moved, in_file) == ("base_camera", shown) and used.position == pytest.approx((0.4, 0, 0.6))
-    file.write_text(text)
-    wait_until(
-        session, lambda view: view.task is not None and view.task.source_hash == version.source_hash, "it"
-    )
-
-
-@pytest.mark.slow
-def test_a_rebuild_while_recording_keeps_every_env_in_place_and_waits_for_a_reset(
-    session: Session,
-) -> None:
-    session.dispatch(RecordingWanted((0,)))
-    wait_until(
-        session,
-        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
-        "the recording",
-    )
-    step(session, 3)
-    count = session.view().of(RecordingStatus).episodes_written
-    before = wait_until(session, lambda view: elapsed(view) == 3, "the steps").task
-    assert before is not None and before.file is not None
-    file, text = Path(before.file), Path(before.file).read_text()
-    file.write_text(text.replace("CUBE_HALF_SIZE = 0.02\n", "CUBE_HALF_SIZE = 0.024\n"))
-    view = wait_until(session, lambda v: v.reload is not None and v.reload.level == "rebuilt", "the rebuild")
-    assert elapsed(view) == 3
-    assert len(written(session, count + 1)[-1].action) == 3
-    view = wait_until(session, lambda view: view.of(RecordingStatus).active, "it to go on")
-    assert view.of(RecordingStatus).waiting == 1 and elapsed(view) == 3
-    session.do(StopRecording())
-    file.write_text(text)
-    wait_until(
-        session, lambda view: view.task is not None and view.task.source_hash == before.source_hash, "it"
-    )
-
-
-@pytest.mark.slow
-def test_recording_the_next_episode_waits_for_a_reset_and_ends_with_the_next(session: Session) -> None:
-    before = session.view().of(RecordingStatus).episodes_written
-    session.dispatch(RecordingWanted((1,), next_episode=True))
-    step(session, 1)
-    view = wait_until(session, lambda view: view.of(RecordingStatus).waiting == 1, "the waiting")
-    assert view.of(RecordingStatus).active and view.of(RecordingStatus).steps == 0
-    session.dispatch(EnvsReset((1,)))
-    wait_until(session, lambda view: view.of(RecordingStatus).waiting == 0, "the reset")
-    step(session, 1)
-    session.change(action_source="zero")
-    step(session, 1)
-    session.dispatch(EnvsReset((1,)))
-    wait_until(session, lambda view: not view.of(RecordingStatus).active, "its end")
-    session.change(action_source="random")
-    step(session, 1)
-    (*_, episode) = written(session, before + 1)
-    assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
-
-
-@pytest.mark.slow
-def test_an_unwritable_folder_is_reported_and_the_session_continues(session: Session, tmp_path: Path) -> None:
-    view = session.view()
-    folder = Path(view.of(RecordingStatus).folder)
-    folder.mkdir(exist_ok=True)  # it may not exist yet
-    aside = folder.rename(folder.with_name("aside"))
-    folder.write_text("in the way")
-    session.dispatch(RecordingWanted((0,)))
-    view = wait_until(session, lambda view: view.of(RecordingStatus).problem is not None, "the problem")
-    assert not view.of(RecordingStatus).active and "is not a folder" in str(view.of(RecordingStatus).problem)
-    step(session, 2)
-    assert session.view().problem is None
-    folder.unlink()
-    aside.rename(folder)
-    session.dispatch(RecordingWanted((0,)))
-    wait_until(
-        session,
-        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
-        "the recording",
-    )
-    assert session.view().of(RecordingStatus).problem is None
-    session.do(StopRecording())
-
-
-@pytest.mark.slow
 def test_a_recording_holds_both_the_moved_and_the_files_camera_placement(
     session: Session, tmp_path: Path
 ) -> None:
@@ -260,12 +118,7 @@ def test_a_recording_holds_both_the_moved_and_the_files_camera_placement(
     count = session.view().of(RecordingStatus).episodes_written
     session.dispatch(CameraPlaced(BASE, there))
     wait_until(session, lambda view: moved(view) == {BASE}, "the placement")
-    session.dispatch(RecordingWanted((0,)))
-    wait_until(
-        session,
-        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
-        "the recording",
-    )
+    begin_recording(session, (0,))
     step(session, 2)
     session.dispatch(SaveWanted((0,)))
     past = written(session, count + 1)[-1]
