@@ -79,12 +79,14 @@ ENVS = 3
 NOW = Now(5.0, 1e9)
 
 
-def loaded(level: Any = None, hash: str = "a", envs: int = ENVS) -> VersionLoaded:
+def loaded(
+    level: Any = None, hash: str = "a", envs: int = ENVS, carried: tuple[str, ...] = ()
+) -> VersionLoaded:
     """An event: the worker has loaded a version, the first one if `level` is None."""
     geometry, poses = table_scene(envs)
     first = step_of(poses, success=np.zeros(envs, bool))
     task = replace(description(geometry, (camera(),)), source_hash=hash)
-    report = None if level is None else Report(level, "")
+    report = None if level is None else Report(level, "", carried)
     return VersionLoaded(Loaded(task, first, {}, report, None), True)
 
 
@@ -198,21 +200,6 @@ def test_any_sequence_is_deterministic_and_records_only_what_was_requested(
             assert EndEpisodes() in effects
 
 
-def test_an_episode_ended_by_a_load_is_followed_by_the_next_of_each_env() -> None:
-    begun = loaded(), RESET, Asked(ToggleRecording()), RESET, STEP
-    state, effects = after(*begun, loaded("patched", "b"))
-    assert EndEpisodes() in effects and not state.recording.env_idx
-    again, effects = after(*begun, loaded("patched", "b"), LoadDone())
-    begin, capture = effects
-    assert isinstance(begin, BeginEpisodes) and begin.task.source_hash == "b"
-    assert capture == Send(SetCapture((0,), from_reset=True)), "a reset would lose the current moment"
-    assert again.recording.since == NOW.wall and again.recording.env_idx == (0,)
-    state, effects = after(*begun, loaded("rebuilt", "b"), LoadDone())
-    assert effects[1:] == [Send(SetCapture((0,), from_reset=True)), Then(EnvsReset((0,)))]
-    state, effects = after(*begun, loaded("same"), LoadDone())
-    assert state.recording.env_idx == (0,) and effects == []
-
-
 def test_envs_that_a_smaller_version_lacks_are_no_longer_recorded() -> None:
     all_envs = Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording())
     state, effects = after(loaded(), *all_envs, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
@@ -268,15 +255,6 @@ def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):
         apply_filtered(state, Asked(SaveSolved()))
-
-
-def test_a_save_that_is_asked_for_while_another_runs_waits_for_it() -> None:
-    state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
-    assert effects == [] and state.recording.saving.unsaved == 2
-    state, (begin,) = apply_filtered(state, EpisodesSaved(1, "saved"))
-    assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [1]
-    state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))
-    assert state.recording.saving.unsaved == 0
 
 
 def test_kept_episodes_are_saved_one_after_another_and_a_stop_counts_those_that_are_lost() -> None:
@@ -382,21 +360,37 @@ def test_a_recording_ends_env_by_env_and_is_saved_once_its_files_are_written() -
 
 
 @pytest.mark.parametrize("one_each", [False, True])
-@pytest.mark.parametrize("level", ["patched", "rebuilt", "restarted"])
-def test_after_a_load_the_envs_are_reset_only_if_they_lost_their_place(level: str, one_each: bool) -> None:
+@pytest.mark.parametrize(
+    ("level", "carried", "put_back"),
+    [
+        ("patched", (), True),
+        ("rebuilt", (), False),
+        ("rebuilt", ("cube",), True),
+        ("restarted", (), False),
+    ],
+)
+def test_after_a_load_the_envs_are_reset_only_if_they_lost_their_place(
+    level: str, carried: tuple[str, ...], put_back: bool, one_each: bool
+) -> None:
     begun = loaded(), RESET, RecordingWanted((0, 2), next_episode=one_each), RESET, STEP
-    state, effects = after(*begun, loaded(level, "b"))
+    state, effects = after(*begun, loaded(level, "b", carried=carried))
     assert EndEpisodes() in effects and not state.recording.env_idx and not state.recording.ended
-    put_back = state.recording.continues is not None and state.recording.continues.put_back
-    assert put_back == (level == "patched")
     ended, _ = apply_filtered(state, EpisodesEnded(state.recording.number))
     assert not ended.recording.ended, "it goes on"
     state, effects = apply_filtered(state, LoadDone())
-    (begin,) = [one for one in effects if isinstance(one, BeginEpisodes)]
+    begin, capture, *_ = effects
+    assert isinstance(begin, BeginEpisodes) and begin.task.source_hash == "b"
+    assert capture == Send(SetCapture((0, 2), from_reset=True)), "a reset would lose the current moment"
     assert begin.env_idx == (0, 2) == state.recording.env_idx and begin.one_each == one_each
+    assert state.recording.since == NOW.wall
     assert (Then(EnvsReset((0, 2))) in effects) == (not put_back and not one_each)
     again, effects = apply_filtered(state, LoadDone())
     assert again.recording == state.recording
+
+
+def test_a_load_without_a_change_does_not_end_a_recording() -> None:
+    state, effects = after(loaded(), RESET, Asked(ToggleRecording()), RESET, loaded("same"), LoadDone())
+    assert state.recording.env_idx == (0,) and effects == []
 
 
 def test_what_is_not_saved_yet_is_counted_and_a_failure_stays_named() -> None:
@@ -414,7 +408,8 @@ def test_what_is_not_saved_yet_is_counted_and_a_failure_stays_named() -> None:
         assert [getattr(one, name) for one in saving.running.episodes] == [False, True, False]
     state, _ = apply_filtered(state, SaveWanted((2,)))
     assert state.recording.saving.unsaved == ENVS + 1
-    state, _ = apply_filtered(state, SaveFailed(1, "the disk is full"))
+    state, (begin,) = apply_filtered(state, SaveFailed(1, "the disk is full"))
+    assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [2]
     status = state.recording.status(state.run).saving
     assert (status.failed, status.message) == (True, "the disk is full") and status.progress is not None
     state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))

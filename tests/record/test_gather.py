@@ -15,6 +15,7 @@ from tests.drive.episodes import appended, made
 from tests.drive.scenes import camera, description, table_scene
 from tests.drive.session import moment
 from tests.record.gathered import assert_rows, columns_of, pictures_of
+from workbench.envs.camera_data import CameraInfo, CameraSettings
 from workbench.envs.step_result import OtherEntry
 from workbench.envs.task_drawings import Drawing
 from workbench.episodes.episode import Episode
@@ -24,6 +25,7 @@ from workbench.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEp
 from workbench.task.description import Stepped
 
 ENVS = 4
+LENS = CameraSettings((0, 0, 1), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "default")
 
 
 def data(number: int) -> dict[str, Any]:
@@ -38,6 +40,7 @@ class Batch:
     folder: Path
     env_idx: Sequence[int] = range(ENVS)
     named: dict[str, Any] = field(default_factory=dict)
+    camera: CameraInfo = field(default_factory=camera)
     number: int = 0
     taken: list[Stepped] = field(default_factory=list)
     ended: list[GatheredEpisode] = field(default_factory=list)
@@ -45,7 +48,7 @@ class Batch:
     def __post_init__(self) -> None:
         self.elapsed = np.zeros(ENVS, np.int32)
         geometry, _ = table_scene(ENVS)
-        self.task = description(geometry, (camera(),))
+        self.task = description(geometry, (self.camera,))
         self.gatherer = EpisodeGatherer(self.task, self.env_idx, self.folder, self.ended.append, **self.named)
 
     def reset(self, *envs: int, to: int = 0, **more: Any) -> None:
@@ -231,6 +234,21 @@ def test_an_episode_tells_how_it_was_reset_and_by_whom_it_was_acted(tmp_path: Pa
     assert second.info.id not in ("first", "") and second.info.reset_options == {"level": 4}
     assert first.info.acted_by == ((0, "hold"), (1, "sliders"), (3, "random"))
     assert second.info.acted_by == first.info.acted_by
+
+
+def test_an_episode_tells_from_which_state_on_a_camera_was_placed_by_hand(tmp_path: Path) -> None:
+    batch = Batch(tmp_path, (0,), camera=replace(camera(), settings=LENS))
+    placed = {camera().key: replace(LENS, fov=0.5)}
+    batch.reset(0, placed=placed)
+    for then in (placed, {}, {}, placed):
+        batch.step(placed=then)
+    batch.gatherer.finish()
+    (episode,) = batch.read()
+    assert [(one.state, one.used.fov, one.in_file.fov) for one in episode.info.moved_cameras] == [
+        (0, 0.5, 1.0),
+        (2, 1.0, 1.0),
+        (4, 0.5, 1.0),
+    ]
 
 
 def test_the_info_is_that_of_the_task(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_every_episode_is_three_self_contained_files(recorded: Recorded) -> None
         files = sorted(episode.path.parent.glob(f"{episode.path.stem}.*"))
         assert [file.suffix for file in files] == [".h5", ".json", ".rrd"]
     read = read_all(recorded)
-    assert read[0].info.acted_by == ((0, "random"),)
+    assert read[0].info.acted_by == ((0, "random"),) and read[0].info.pictures == "exact"
     assert {"articulations/panda", "actors/cube"} <= read[0].env_states.keys()
     assert read[0].obs["agent/qpos"].shape == (6, 9)
     assert read[0].info.env_kwargs == {
@@ -88,17 +88,6 @@ def test_every_episode_is_three_self_contained_files(recorded: Recorded) -> None
         "reward_mode": "normalized_dense",
         "control_mode": "pd_joint_delta_pos",
     }
-
-
-def test_a_recording_names_the_kind_of_its_pictures(
-    recorded: Recorded, renderer: None, tmp_path: Path
-) -> None:
-    assert {episode.info.pictures for episode in read_all(recorded)} == {"exact"}
-    options = TaskOptions(num_envs=1)
-    fast = record(RecordOptions("PushCube-v1", tmp_path, 1, fast_pictures=True, max_steps=1, options=options))
-    (episode,) = read_all(fast)
-    assert episode.info.pictures == "fast"
-    assert options_of(episode.info, 1).pictures == "fast", "it must be rescored with the same kind"
 
 
 def test_an_episode_starts_like_the_stock_env_with_its_seed(recorded: Recorded) -> None:
@@ -290,11 +279,13 @@ def test_demonstrations_are_replayed_from_their_own_seeds(
     assert begins == 0 and demonstration.name in source
 
 
-def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -> None:
-    what = RecordOptions(
-        str(TASKS / "push_cube.py"), tmp_path, 1, max_steps=2, options=TaskOptions(num_envs=1)
-    )
+def test_pictures_of_every_camera_are_recorded_with_their_kind(renderer: None, tmp_path: Path) -> None:
+    options = TaskOptions(num_envs=1)
+    task = str(TASKS / "push_cube.py")
+    what = RecordOptions(task, tmp_path, 1, fast_pictures=True, max_steps=2, options=options)
     (episode,) = read_all(record(what))
+    assert episode.info.pictures == "fast"
+    assert options_of(episode.info, 1).pictures == "fast", "it must be rescored with the same kind"
     cameras = {track.info.name: track for track in episode.cameras}
     assert {"base_camera", "render_camera"} <= cameras.keys()
     assert len(cameras["base_camera"].frame) == 3

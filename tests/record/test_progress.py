@@ -54,19 +54,12 @@ def written(number: int, success: bool = True, corrected: bool = False) -> Writt
     return Written(number, Path(f"/elsewhere/{number}.rrd"), number, 9, 1.5, success, corrected)
 
 
-def test_results_are_ordered_and_only_the_wanted_successes_are_kept(tmp_path: Path) -> None:
+def test_results_are_ordered_and_counted(tmp_path: Path) -> None:
     what = replace(PLAIN, out=tmp_path, episodes=5)
     known = {3: written(3, corrected=True), 0: written(0), 1: None, 2: written(2, corrected=True)}
     found = collect(what, known)
     assert [(one.index, one.path) for one in found.written] == [(n, tmp_path / f"{n}.rrd") for n in (0, 2, 3)]
     assert (found.tried, found.missing, found.start_corrected, found.stopped) == (4, 1, 2, False)
-    for number in (0, 2, 3):
-        for suffix in (".rrd", ".h5", ".json"):
-            (tmp_path / f"{number}{suffix}").touch()
-    found = collect(replace(what, episodes=None, successes=2, tries=5), known)
-    assert [one.index for one in found.written] == [0, 2]
-    assert (found.tried, found.missing) == (3, 0)
-    assert {file.stem for file in tmp_path.iterdir()} == {"0", "2"}, "a surplus episode is removed"
 
 
 @pytest.mark.parametrize(

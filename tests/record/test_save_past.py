@@ -207,7 +207,13 @@ def test_a_stopped_job_writes_nothing_and_tells_nothing_more(fake: FakeWorkerSes
 def test_an_episode_of_an_earlier_version_has_its_source(fake: FakeWorkerSession, saver: Saver) -> None:
     old = fake.view.task
     assert old is not None
-    fake.load("patched", source={"push.py": "new"}, source_hash="1" * 12)
+    wider = replace(SETTINGS, fov=0.75)
+    fake.load(
+        "patched",
+        source={"push.py": "new"},
+        source_hash="1" * 12,
+        cameras=(replace(scene_camera(), settings=wider),),
+    )
     fake.reset()
     fake.step()
     ended = saver.save(wanted(fake, (0,), before=True))
@@ -217,6 +223,10 @@ def test_an_episode_of_an_earlier_version_has_its_source(fake: FakeWorkerSession
     assert now is not None
     assert (earlier.info.source_hash, earlier.info.observed_by) == (old.source_hash, now.source_hash)
     assert list(earlier.info.source.values()) == list(old.source.values())
+    (camera,) = earlier.info.moved_cameras
+    assert (camera.used.fov, camera.in_file.fov) == (0.75, 0.5), (
+        "its source has another camera than its pictures"
+    )
 
 
 def test_an_env_that_went_back_is_saved_along_its_own_past(fake: FakeWorkerSession, saver: Saver) -> None:
