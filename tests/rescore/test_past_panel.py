@@ -22,7 +22,6 @@ from workbench.live.timeline_commands import (
     TurnRescored,
 )
 from workbench.page.widgets.line_chart import MAX_POINTS, SELECTED_COLOUR
-from workbench.rescore import verdict_text
 from workbench.rescore.past_panel import chart_data
 from workbench.rescore.past_scores import PastRun, RescoredCurve
 from workbench.rescore.result_parts import MAX_ROWS, RECORD_COLOUR
@@ -155,38 +154,3 @@ def test_only_the_part_of_a_long_record_around_the_shown_moment_is_drawn() -> No
     x, _, _, cursor = chart_data(curve, 7 + MAX_POINTS)
     assert len(x) == MAX_POINTS and cursor == MAX_POINTS
     assert chart_data(curve, 10**6)[-1] is None
-
-
-# --- the texts of a verdict, which `workbench rescore` prints too ----------------------------------
-
-
-@pytest.mark.parametrize(
-    ("metres", "radians", "says", "far"),
-    [(0.0, 0.0, "exactly where it was recorded", False), (4e-4, 1e-4, "0.4 mm", False), (0.032, 0.0, "3.2 cm", True)]
-    + [(0.0, 0.2, "11°", True), (float("inf"), 0.0, "infinite", True)],
-)  # fmt: skip
-def test_drift_is_reported_and_large_drift_raises_doubt(
-    metres: float, radians: float, says: str, far: bool
-) -> None:
-    found = [same(1), same(7, metres=metres, radians=radians)]
-    summary = verdict_text.drift_summary(found)
-    assert says in summary and verdict_text.count_drifted(found) == far
-    assert metres == 0 or ("env 7" in summary) == far
-
-
-def test_outcomes_come_before_rewards_and_nan_is_counted() -> None:
-    moved = verdict_text.change_text(episode(success=(None, 41), fail=(7, None)))
-    assert moved.index("success") < moved.index("41") < moved.index("fail") < moved.index("7")
-    lost, nan = float("inf"), float("nan")
-    texts = {
-        verdict_text.change_text(episode(largest=lost, returns=two))
-        for two in ((1.0, nan), (nan, 1.0), (nan, nan))
-    }
-    assert len(texts) == 3 and all("NaN" in one for one in texts)
-    verdicts = [episode(returns=(1.0, 2.0)), episode(1, returns=(1.0, nan))]
-    assert verdict_text.totals(verdicts) == ["mean return: 1 → 2, NaN in 1 of 2"]
-    none, flags = same(0, has=()), same(0, has=("success", "fail"))
-    assert verdict_text.totals([none]) == [] and "return" not in "".join(verdict_text.totals([flags]))
-    assert verdict_text.returns_text(none) == "" and "2 of 2" in verdict_text.headline(
-        [episode(0), episode(1)], so_far=True
-    )

@@ -34,7 +34,6 @@ ORIGINAL = (
     .replace("from typing import Any", "import os\nimport time\nfrom typing import Any", 1)
 )
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
-SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
 IN_RESCORER = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
 """An expression that is true in the rescoring process, which has a lower priority."""
 
@@ -127,32 +126,6 @@ def test_a_doubled_reward_is_rescored_as_double_bit_for_bit(desk: Desk, record) 
         assert verdict.returns[1] == pytest.approx(2 * verdict.returns[0])
     assert view.differing_names == {"reward"}
     assert not view.warnings
-
-
-@pytest.mark.slow
-def test_episodes_with_a_changed_success_are_listed_with_their_steps(desk: Desk, record) -> None:
-    """The new success is "the gripper is above a height", which can be computed from the recorded poses."""
-    hand = desk.session.view().task.geometry.body_names.index("panda/panda_hand_tcp")
-    heights = np.array([moment.step.poses[:, hand, 2] for moment in record])
-    limit = float(np.float32(np.quantile(heights, 0.8)))
-    desk.edit(SUCCESS, f'"success": self.agent.tcp.pose.p[:, 2] > {limit!r},')
-    view = desk.rescored()
-    wanted = {}
-    for env in range(N):
-        begins = [k for k, moment in enumerate(record) if moment.jumped[env]]
-        for begin, end in zip(begins, [*begins[1:], len(record)], strict=True):
-            above = [k for k in range(begin, end) if heights[k, env] > limit]
-            if above and end > begin + 1:
-                step = record[above[0]]
-                wanted[env, record[begin].serial] = (int(step.step.elapsed_steps[env]), step.serial)
-    assert len(wanted) > 2
-    found = {
-        (v.of.env, int(v.of.serials[0])): (v.success[1], v.of.at(v.look_at))
-        for v in view.verdicts
-        if v.success[1] is not None
-    }
-    assert found == wanted
-    assert all(verdict.success[0] is None for verdict in view.verdicts)
 
 
 @pytest.mark.slow

@@ -111,14 +111,6 @@ def test_no_recording_is_opened_in_this_process(
     assert [run.length for run in read_actions(foreign)[0]] == [STEPS, STEPS]
 
 
-def test_todays_file_is_found_and_gives_the_recorded_values(author: Path) -> None:
-    verdicts, notes = rescore_all(RescoreOptions((author / "recordings",)))
-    assert [verdict.seed for verdict in verdicts] == [20, 21, 22] and notes == ()
-    for verdict in verdicts:
-        assert not verdict.differs and verdict.differing == () and verdict.metres == 0
-        assert verdict.missed == {} and not verdict.start_differs and verdict.length == STEPS
-
-
 def test_an_edited_reward_differs_by_the_edit_and_the_recorded_text_does_not(author: Path) -> None:
     edit(author, REWARD, f"{REWARD} + 0.25")
     files = tuple(sorted((author / "recordings").glob("*.rrd"))[:2])
