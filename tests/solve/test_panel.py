@@ -34,7 +34,6 @@ from workbench.solve.panel import (
     PREDICTED,
     SAVE_SOLVED,
     USE_MODE,
-    horizon_seconds,
     in_words,
     solve_html,
 )
@@ -59,9 +58,13 @@ class Solve:
     def __init__(self, live: Live) -> None:
         self.live = live
 
-    def draw(self, solve: SolveView = SOLVED, source: Any = "solve", **changes: Any) -> None:
+    def draw(
+        self, solve: SolveView = SOLVED, source: Any = "solve", horizon: float = 0.0, **changes: Any
+    ) -> None:
         view = running(2, **{"playing": False, "state": "paused", "solve": solve, **changes})
-        view = replace(view, settings=Settings(action_source=source, plan=PlanOptions(rollouts=32)))
+        view = replace(
+            view, settings=Settings(action_source=source, plan=PlanOptions(rollouts=32, horizon=horizon))
+        )
         self.live.show(view, rows_of())
 
 
@@ -89,6 +92,8 @@ def test_the_folder_shows_the_rollouts_returns_and_the_result(solve: Solve) -> N
     assert chart.of(ACHIEVED)[:, 1] == pytest.approx([0.4, 0.6, 0.8], abs=0.01)
     solve.draw(replace(SOLVED, predicted=SOLVED.predicted[:1], achieved=SOLVED.achieved[:1]))
     assert part.charts() == []
+    solve.draw(horizon=1.0)
+    assert part.field("Horizon").value == 1.0
 
 
 def test_the_episodes_return_equals_the_env_tables() -> None:
@@ -205,8 +210,3 @@ def test_the_control_mode_that_suits_planning_is_offered_if_the_robot_has_it(sol
     assert solve.live.asked == [UseControlMode(mode="pd_ee_delta_pose")]
     solve.draw(task=replace(task, control_mode="pd_ee_delta_pose"))
     assert not solve.live.shows(USE_MODE)
-
-
-def test_the_default_horizon_is_converted_to_seconds() -> None:
-    assert horizon_seconds(PlanOptions(), 0.05) == pytest.approx(0.5)
-    assert horizon_seconds(PlanOptions(horizon=1.0), 0.05) == pytest.approx(1.0)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
-import pytest
 import viser
 
 from tests.drive.panels import Panels
@@ -20,19 +17,6 @@ def paths_along_x(count: int = 5, steps: int = 4) -> np.ndarray:
     paths[..., 0] = np.arange(steps + 1)
     paths[..., 1] = np.arange(count)[:, None]
     return paths
-
-
-@pytest.fixture
-def panels(server: viser.ViserServer) -> Iterator[Panels]:
-    yield Panels(server)
-
-
-def test_the_best_path_is_drawn_last_and_bright() -> None:
-    points, colours = segments(paths_along_x())
-    assert points.shape == colours.shape == (20, 2, 3)
-    best = points[-4:]
-    assert best[:, :, 1].max() == 0 and sorted(best[:, 0, 0]) == [0, 1, 2, 3]
-    assert (colours[-4:] == BEST).all() and not (colours[:-4] == BEST).all(-1).any()
 
 
 def test_one_node_draws_all_paths_at_the_envs_offset(server: viser.ViserServer, panels: Panels) -> None:
@@ -53,6 +37,9 @@ def test_the_chosen_path_is_marked_and_what_is_not_finite_is_left_out(
     server: viser.ViserServer, panels: Panels
 ) -> None:
     paths = paths_along_x()
+    points, colours = segments(paths)
+    assert points.shape == colours.shape == (20, 2, 3)
+    assert points[-4:, :, 1].max() == 0 and (colours[-4:] == BEST).all(), "the best path is drawn last"
     points, colours = segments(paths, 3)
     tones = {int(y): tuple(colours[points[:, 0, 1] == y][0, 0]) for y in range(5)}
     assert tones[0] == BEST and tones[3] == CHOSEN and len(set(tones.values())) == 5

@@ -38,9 +38,7 @@ def solve(fake: FakeWorkerSession, seeds: int) -> SeedsView:
 
 
 @pytest.mark.slow
-def test_each_seed_is_solved_recorded_and_reported_and_results_stay_after_a_stop(
-    child_process: None, tmp_path: Path
-) -> None:
+def test_each_seed_is_solved_recorded_and_reported_until_a_stop(child_process: None, tmp_path: Path) -> None:
     with solving(str(TASKS / "push_cube.py"), tmp_path / "recordings") as told:
         view = solve(told, 200)
         assert view.state == "starting" and view.total == 200
@@ -56,8 +54,6 @@ def test_each_seed_is_solved_recorded_and_reported_and_results_stay_after_a_stop
         first = view.report.seeds[0]
         assert first.seed == 0 and bool(first.solved_at) != bool(first.in_the_way)
         assert first.path.is_file() and first.path.parent == tmp_path / "recordings"
-        told.load("patched")
-        assert told.view.of(SeedsView).stale and told.view.of(SeedsView).report is view.report
 
 
 @pytest.mark.slow
