@@ -216,6 +216,19 @@ def test_a_stopped_job_reports_nothing_and_the_next_one_runs(making: Making, wor
     assert [one.words for one in ended(making).made] == ["made"]
 
 
+def test_closing_waits_for_work_in_progress_but_not_forever(
+    making: Making, work: Work, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "END_SECONDS", 0.1)
+    work.go_on.clear()
+    making.start(MakeRequest("zip", (), Path("/out")))
+    making.close()
+    assert making.view().running, "the hanging work still runs"
+    work.go_on.set()
+    view = ended(making)
+    assert (view.problem, view.made) == ("", ())
+
+
 def test_each_download_has_a_folder_of_its_own_until_the_end(making: Making, work: Work) -> None:
     def write_two(wanted: MakeRequest) -> Made:
         paths = tuple(wanted.folder / name for name in ("a", "b"))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
+from tests.drive.episodes import made
 from tests.drive.page import page_at
-from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.episodes.episode import Episode, EpisodeInfo
 from workbench.share.scene_html import write_scene_html
 
 DRAWN = """before => {
@@ -20,38 +18,15 @@ DRAWN = """before => {
         const p = node.message?.props?.batched_positions;
         if (!p) return false;
         const x = new DataView(p.buffer, p.byteOffset, 4).getFloat32(0, true);
-        return Math.abs(x - (-0.3 + 0.03 * step)) < 1e-4;
+        return Math.abs(x - 0.03 * step) < 1e-4;
     });
 }"""
 """Whether the caption shows another step than before, and the cube is drawn at its pose of that step."""
 
 
-@pytest.fixture
-def episode() -> Episode:
-    steps = 20
-    poses = np.zeros((steps + 1, 1, 7), np.float32)
-    poses[:, 0, 0], poses[..., 3] = np.linspace(-0.3, 0.3, steps + 1), 1
-    corners = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]], np.float32)
-    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint32)
-    zero = np.zeros(1, np.int32)
-    visual = Visual("cube", Mesh(corners, faces), Material((1.0, 0.0, 0.0, 1.0)), zero, zero)
-    return Episode(
-        info=EpisodeInfo("Made & <b>", 0, 7, None, "", {}, 0.1, None, "cpu"),
-        geometry=SceneGeometry(1, ("cube",), ("dynamic",), (False,), (visual,)),
-        segmentation={},
-        poses=poses,
-        action=np.zeros((steps, 1), np.float32),
-        action_names=("grip",),
-        reward=np.zeros(steps, np.float32),
-        terminated=np.zeros(steps, np.bool_),
-        truncated=np.zeros(steps, np.bool_),
-        evaluate={},
-        cameras=[],
-    )
-
-
 @pytest.mark.slow
-def test_a_scene_page_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Browser) -> None:
+def test_a_scene_page_plays_without_a_server(tmp_path: Path, browser: Browser) -> None:
+    episode = made(20, seed=7, speed=0.03, task="Made & <b>", control_dt=0.1)
     path, done = tmp_path / "a.html", []
     write_scene_html(path, episode, on_progress=done.append)
     assert done == sorted(done) and done[-1] == 1.0
@@ -80,8 +55,8 @@ def test_a_scene_page_plays_without_a_server(episode: Episode, tmp_path: Path, b
     assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
-def test_a_scene_page_overwrites_no_file(episode: Episode, tmp_path: Path) -> None:
+def test_a_scene_page_overwrites_no_file(tmp_path: Path) -> None:
     (tmp_path / "a.html").write_text("mine")
     with pytest.raises(FileExistsError):
-        write_scene_html(tmp_path / "a.html", episode)
+        write_scene_html(tmp_path / "a.html", made())
     assert (tmp_path / "a.html").read_text() == "mine"
