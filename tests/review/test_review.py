@@ -21,9 +21,7 @@ from workbench.episodes.row import UnreadableRecording
 from workbench.library.folder import Library
 from workbench.live.commands import TogglePlay
 from workbench.live.messages import CameraRequest
-from workbench.review.commands import (
-    OpenAgain,
-)
+from workbench.review.commands import OpenAgain
 from workbench.review.panel import facts_html
 from workbench.review.playback import Review
 from workbench.review.view import Opened, PictureReader, column_at
@@ -169,24 +167,6 @@ def test_the_newest_recording_is_opened_beside_the_library_once_listed_and_only_
     library.close()
 
 
-def test_the_first_recordings_are_shown_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
-    library = FakeLibrary({id: made(10) for id in "abc"})
-    go_on = threading.Event()
-
-    def read(row: Row, *_: object) -> Episode:
-        assert row.id != "c" or go_on.wait(60)
-        return library.read(row)
-
-    review = Review(library, read, clock=library.clock)  # type: ignore[arg-type]
-    review.open("abc", state=4)
-    view = reach(review, lambda view: len(view.opened) == 2, "the first two")
-    assert view.loading == "opening 3 of 3: file c" and view.position == 4
-    go_on.set()
-    view = reach(review, lambda view: not view.loading, "the last")
-    assert [o.id for o in view.opened] == ["a", "b", "c"]
-
-
 def test_another_opening_ends_one_that_has_already_shown_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
     library = FakeLibrary({"a": made(10), "b": made(20), "c": made(30)})
@@ -224,11 +204,7 @@ def test_real_files_are_read_with_scene_pictures_and_numbers(child_process: None
     seen = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
     assert seen.rgb is not None and seen.depth is not None
     assert abs(int(seen.rgb.mean()) - 40) <= 2 and np.allclose(seen.depth, 0.2) and seen.segmentation is None
-    again = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
-    assert again is seen, "the same state is not decoded again"
     assert seen.degree is None, "only recordings that name fast pictures have a degree"
-    of_fast = replace(one.episode, info=replace(one.episode.info, pictures="fast"))
-    assert reader.pictures(of_fast, 2, wanted, env=0)["sensor", "base_camera"].degree == "fast"
     library.close()
 
 
