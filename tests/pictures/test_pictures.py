@@ -76,16 +76,13 @@ def test_pictures_of_float_shaders_equal_maniskills() -> None:
     env.close()
 
 
-@pytest.mark.parametrize(("make", "obs_first"), [(batched, False), (batched, True), (stock, True)])
-def test_human_pictures_equal_maniskills_rendering(make: Any, obs_first: bool) -> None:
-    env = make("PickCube-v1", obs_mode="rgb", render_mode="rgb_array")
+def test_human_pictures_of_a_stock_env_equal_maniskills_rendering() -> None:
+    env = stock("PickCube-v1", obs_mode="rgb", render_mode="rgb_array")
     act(env)
-    if obs_first:  # leaves the goal hidden
-        env.get_obs(env.get_info())
-    ours = [take_pictures(env, e, [("render_camera", "human", ["rgb"])])[0] for e in range(env.num_envs)]
-    wanted = env.render_rgb_array().cpu().numpy()
-    for picture in ours:
-        np.testing.assert_array_equal(picture.rgb, wanted[picture.env])
+    env.get_obs(env.get_info())  # leaves the goal hidden
+    (picture,) = take_pictures(env, 0, [("render_camera", "human", ["rgb"])])
+    np.testing.assert_array_equal(picture.rgb, env.render_rgb_array().cpu().numpy()[0])
+    assert (picture.kind, picture.env) == ("human", 0)
     env.close()
 
 
@@ -104,21 +101,6 @@ def test_a_picture_leaves_no_trace() -> None:
         before = state()
         take_pictures(env, 0, [("base_camera", "sensor", ["rgb"]), ("render_camera", "human", ["rgb"])])
         assert state() == before
-    env.close()
-
-
-def test_the_goal_is_hidden_from_sensors_and_visible_to_human_cameras() -> None:
-    env = batched("PickCube-v1", sensor_configs={"width": 512, "height": 512})
-    names = segmentation_names(env)
-    goal = next(number for number, name in names.items() if name == "goal_site")
-    human, sensor = take_pictures(
-        env, 0, [("render_camera", "human", ["segmentation"]), ("base_camera", "sensor", ["segmentation"])]
-    )
-    assert (human.kind, sensor.kind) == ("human", "sensor")
-    assert human.segmentation is not None and sensor.segmentation is not None
-    assert (human.segmentation == goal).any() and not (sensor.segmentation == goal).any()
-    seen = {names[i] for i in np.unique(sensor.segmentation) if i != 0}
-    assert {"cube", "table-workspace", "ground", "panda/panda_hand"} <= seen
     env.close()
 
 

@@ -37,33 +37,6 @@ def measured(env: Any, placement: Placement, size: tuple[int, int]) -> CameraRep
     return join_reports([measure_placement(env, e, placement, size=size) for e in range(N)])
 
 
-@pytest.mark.slow
-def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
-    space = SearchSpace(("cube", "goal_region"), LOW, HIGH, LENS, candidates=12, best=2, apart=0.2)
-    progress: list[tuple[int, int]] = []
-    before = [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes]
-    found = suggest_cameras(env, space, range(N), progress=lambda done, total: progress.append((done, total)))
-    assert [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes] == before
-    assert 1 <= len(found) <= 2 and [s.score for s in found] == sorted((s.score for s in found), reverse=True)
-    for suggestion in found:
-        eye = np.array(suggestion.settings.position)
-        assert (eye >= LOW).all() and (eye <= HIGH).all()
-        away = np.subtract(suggestion.target, eye)
-        np.testing.assert_allclose(
-            axes_of(suggestion.settings.quaternion)[0], away / np.linalg.norm(away), atol=1e-9
-        )
-        # Measured again from its settings alone, the placement gets the same score.
-        again = measured(env, Placement(suggestion.settings), suggestion.report.measured_size)
-        assert score_of(again, space.objects) == pytest.approx(suggestion.score, abs=1e-6)
-        assert all(thing.summary().seen == 1 for thing in again.wanted_objects(space.objects))
-        assert suggestion.picture.rgb is not None and suggestion.picture.rgb.shape == (64, 96, 3)
-    assert found[0].score > 0.6
-    eyes = np.array([s.settings.position for s in found])
-    assert all(np.linalg.norm(a - b) >= 0.2 for i, a in enumerate(eyes) for b in eyes[:i])
-    done = [looks for looks, _ in progress]
-    assert done == sorted(done) and done[-1] == progress[-1][1]
-
-
 def test_a_cancelled_search_ends_at_once_with_its_results(env: Any) -> None:
     looks: list[int] = []
     space = SearchSpace(("cube",), LOW, HIGH, LENS, candidates=1000)
