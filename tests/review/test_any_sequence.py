@@ -212,13 +212,6 @@ def test_any_sequence_gives_drawable_and_reproducible_states(
     assert [plain(state) for state in states] == [plain(state) for state in states_after(happened)]
 
 
-def test_a_scene_that_is_made_after_its_recording_was_opened_is_drawn() -> None:
-    happened = [lambda state: Open(("a",)), *[read_next(0, False)] * 2, scene("a", 0, True)]
-    *_, before, after = states_after([(event, 0.0) for event in happened])
-    assert [state.view.opened[0].has_scene for state in (before, after)] == [False, True]
-    assert after.view.opened_serial > before.view.opened_serial
-
-
 @pytest.mark.parametrize(("mode", "drawn"), [("dense", True), ("none", False)])
 def test_only_a_task_with_a_reward_has_a_line_on_the_strip(mode: str, drawn: bool) -> None:
     episode = made(10, env_kwargs={"reward_mode": mode})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,14 +26,10 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 @pytest.fixture(scope="module")
 def push() -> Iterator[OpenedTask]:
-    opened = opened_with(TASKS / "push_cube.py", 2, **MADE)
+    options, opening = TaskOptions(2, "cpu", 0, MADE), Opening(on_finding=lambda finding: None)
+    opened = build_task(load_task(str(TASKS / "push_cube.py")), options, opening)
     yield opened
     opened.env.close()
-
-
-def opened_with(file: Path, num_envs: int, **env_kwargs: object) -> OpenedTask:
-    options = TaskOptions(num_envs, "cpu", 0, env_kwargs)
-    return build_task(load_task(str(file)), options, Opening(on_finding=lambda finding: None))
 
 
 def bodies_in(opened: OpenedTask, envs: list[int]) -> tuple[dict[str, bytes], ...]:
