@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -191,25 +189,3 @@ def test_a_rescoring_in_an_endless_loop_can_be_stopped_and_the_next_one_runs(des
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
     assert any(verdict.differs for verdict in desk.rescored("done").verdicts)
-
-
-@pytest.mark.slow
-def test_a_dead_rescoring_process_is_reported_and_replaced_for_the_next_rescoring(desk: Desk, record) -> None:
-    slow = f"time.sleep(0.1 if {IN_RESCORER} else 0)"
-    desk.edit(REWARD, f"{slow}\n        {REWARD}")
-    desk.rescored("rescoring")
-    first = background_pid(desk.session)
-    desk.note()
-    os.kill(first, signal.SIGKILL)
-    view = desk.rescored("failed")
-    assert "killed by SIGKILL" in view.why
-    desk.note()
-    desk.edit(REWARD, f"{REWARD} * 2")
-    desk.rescored("done")
-    second = background_pid(desk.session)
-    assert second not in (None, first)
-    # The process is kept for the next rescoring.
-    desk.note()
-    desk.edit(REWARD, f"{REWARD} * 3")
-    desk.rescored("stopped", "done")
-    assert background_pid(desk.session) == second
