@@ -195,7 +195,7 @@ def test_invalid_settings_are_refused_and_change_nothing(env: Any, change: dict,
     assert settings_of_camera(env, BESIDE) == before
 
 
-def test_a_camera_whose_lens_differs_between_envs_has_no_settings_and_an_equal_one_has(env: Any) -> None:
+def test_a_camera_whose_lens_differs_between_envs_has_no_settings_and_an_equal_one_has() -> None:
     pose = sapien.Pose([0.1, 0.2, 0.3], [2.0, 0, 0, 0])
 
     def settings(**lens: Any) -> CameraSettings | None:

@@ -251,7 +251,7 @@ def test_an_episode_tells_from_which_state_on_a_camera_was_placed_by_hand(tmp_pa
     ]
 
 
-def test_the_info_is_that_of_the_task(tmp_path: Path) -> None:
+def test_the_info_is_that_of_the_task() -> None:
     task = replace(
         description(table_scene(2)[0]),
         file="/tasks/push.py",

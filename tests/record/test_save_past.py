@@ -251,7 +251,7 @@ def test_an_env_that_went_back_is_saved_along_its_own_past(fake: FakeWorkerSessi
     assert [one.env_idx for one in saver.process.of(CaptureMoment)] == [(2,), (2,), (0,)]
 
 
-def test_the_episode_of_the_shown_moment_is_saved(fake: FakeWorkerSession, saver: Saver) -> None:
+def test_the_episode_of_the_shown_moment_is_saved(fake: FakeWorkerSession) -> None:
     first = fake.view.timeline.last - 3
     fake.reset(seeds=np.array([15, 16, 17]))
     fake.step()

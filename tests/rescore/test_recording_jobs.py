@@ -102,7 +102,7 @@ def test_a_changed_success_is_found_at_the_same_state_as_by_direct_computation(
 
 
 def test_unusable_recordings_are_reported_with_a_reason_and_the_others_are_rescored(
-    tmp_path: Path, recorded: Recorded
+    recorded: Recorded,
 ) -> None:
     task = opened(str(TASKS / "push_cube.py"), 2)
     run = recorded.run(0)
