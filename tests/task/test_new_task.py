@@ -114,3 +114,12 @@ def test_only_a_file_of_comments_and_blank_lines_is_filled(
         with pytest.raises(CannotBegin, match="no longer empty"):
             fill_blank_file(file)
         assert file.read_bytes() == content
+
+
+def test_a_filled_file_gets_an_id_that_no_other_task_has(tmp_path: Path) -> None:
+    # ManiSkill has Empty-v1.
+    for name, env_id in (("empty.py", "MyEmpty-v1"), ("my_empty.py", "MyMyEmpty-v1")):
+        (tmp_path / name).touch()
+        fill_blank_file(tmp_path / name)
+        task = read_task_file(tmp_path / name)
+        assert task is not None and task.ids == (env_id,)

@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from typing import Literal
 
@@ -99,7 +100,7 @@ def is_blank(file: Path) -> bool:
 def fill_blank_file(file: Path) -> None:
     """Write the first template into a file that contains only comments and blank lines, which stay above it.
 
-    The file's name gives the class and the id.
+    The file's name gives the class and the id; if another task has that id, the prefix ``My`` is added.
 
     Raises:
         CannotBegin: the file is unchanged.
@@ -107,7 +108,9 @@ def fill_blank_file(file: Path) -> None:
     content = _blank_content(file)
     if content is None:
         raise CannotBegin(f"{file.name} is no longer empty, and was not overwritten.")
-    text, _, _ = _new_text(file, camel_case(file.stem), TEMPLATES[0].name)
+    name, owners = camel_case(file.stem), _owners_of_ids(file)
+    names = chain([name, f"My{name}"], (f"My{name}{number}" for number in count(2)))
+    text, _, _ = _new_text(file, next(name for name in names if f"{name}-v1" not in owners), TEMPLATES[0].name)
     above = content.rstrip()
     try:
         done = replace_file(file, (above + b"\n\n" if above else b"") + text.encode(), expected=content)
@@ -202,12 +205,18 @@ def _new_text(file: Path, bare: str, origin: str) -> tuple[str, str, NewTask]:
     return text, encoding, NewTask(file, env_id, class_name, known[-1][0] == old_class)
 
 
-def _check_id(env_id: str, file: Path) -> None:
+def _owners_of_ids(file: Path) -> dict[str, str]:
+    """What already has each id: ManiSkill, or the name of an example or of another file in the folder."""
     here = [path for path in sorted(file.parent.glob("*.py")) if path != file]
     owners = dict.fromkeys(maniskill_ids(), "ManiSkill")
     for path in (*example_tasks(), *here):
         task = read_task_file(path)
         owners.update(dict.fromkeys(() if task is None else task.ids, path.name))
+    return owners
+
+
+def _check_id(env_id: str, file: Path) -> None:
+    owners = _owners_of_ids(file)
     if env_id in owners:
         raise CannotBegin(
             f"The task would register {env_id}, which is already an id of {owners[env_id]}: use another name, such as "
