@@ -110,7 +110,9 @@ def fill_blank_file(file: Path) -> None:
         raise CannotBegin(f"{file.name} is no longer empty, and was not overwritten.")
     name, owners = camel_case(file.stem), _owners_of_ids(file)
     names = chain([name, f"My{name}"], (f"My{name}{number}" for number in count(2)))
-    text, _, _ = _new_text(file, next(name for name in names if f"{name}-v1" not in owners), TEMPLATES[0].name)
+    text, _, _ = _new_text(
+        file, next(name for name in names if f"{name}-v1" not in owners), TEMPLATES[0].name
+    )
     above = content.rstrip()
     try:
         done = replace_file(file, (above + b"\n\n" if above else b"") + text.encode(), expected=content)
