@@ -50,9 +50,9 @@ def test_every_fold_is_reached_by_tab_and_toggled_by_enter_and_space(example: At
         choose(page, "how the envs are made")
         heading = page.get_by_role("button", name="How the envs are made")
         expect(heading).to_be_focused()
-        desk.press("v")
+        desk.switch_to("review")
         expect(page.get_by_role("tab", name="Library")).to_be_visible()
-        desk.press("v")
+        desk.switch_to("live")
         expect(page.get_by_role("button", name="How the envs are made")).to_be_visible()
         assert desk.errors == []
 

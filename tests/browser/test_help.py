@@ -89,12 +89,12 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
         leads_to_help("palette")
         leads_to_help("palette", "Solve a task before training on it", "help: solve a task before")
         desk.leave_inputs()
-        desk.press("v")
+        desk.switch_to("review")
         expect(desk.page.get_by_role("tab", name="Library")).to_be_visible()
         leads_to_help("link", "Record episodes and review them")
         leads_to_help("palette")
         desk.leave_inputs()
-        desk.press("v")
+        desk.switch_to("live")
         expect(desk.button("Play")).to_be_visible()
 
 

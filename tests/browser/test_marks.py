@@ -82,9 +82,9 @@ def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
     expect(mark).to_contain_text("camera moved: base_camera")
     expect_on_every_tab(desk, mark)
     # Nor after the review: both switches rebuild the whole page.
-    desk.press("v")
+    desk.switch_to("review")
     expect(desk.page.get_by_text("Library", exact=True).first).to_be_visible()
-    desk.press("v")
+    desk.switch_to("live")
     expect(mark).to_be_visible()
     assert end_of_the_left_arrow(desk.page) is None
     text = desk.file.read_text()

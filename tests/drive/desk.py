@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from playwright.sync_api import FloatRect, Locator, Page, expect
 
@@ -34,6 +35,11 @@ class Desk:
     def press(self, *keys: str) -> None:
         for key in keys:
             self.page.keyboard.press(key)
+
+    def switch_to(self, page: Literal["live", "review"]) -> None:
+        """Show the other page by its key, and wait until keys work there: a page gets them last."""
+        self.press("v")
+        expect(self.page.locator(f'.wb-all-keys[data-contexts~="{page}"]')).to_be_attached()
 
     def leave_inputs(self) -> None:
         """Blur the focused input, so that no slider takes the keys. A click on the view could select an env instead."""
